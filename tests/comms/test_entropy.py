@@ -11,8 +11,9 @@ import torch
 from hypothesis import given, strategies as st
 
 from manyeyes.comms import wire
+from manyeyes.comms.drop_counts import DropCounts
 from manyeyes.comms.entropy import TOTAL, CodeTables, count_fitting_coded_cells, pack_coded, unpack_coded
-from manyeyes.comms.inbox import DropCounts, Inbox
+from manyeyes.comms.inbox import Inbox
 from manyeyes.comms.primitives import PacketError, pack_cells
 from manyeyes.comms.token_selection import select_within_budget
 from manyeyes.datatypes import BevGrid, ConfigError, Message, Sites, SparseBev, Transform, WireError

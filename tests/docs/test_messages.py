@@ -5,7 +5,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from manyeyes.agents.strategies.late import DISPLACED_SCORE_FACTOR, DUPLICATE_DISTANCE_M, LateFusion
-from manyeyes.comms.inbox import DropCounts
+from manyeyes.comms.drop_counts import DropCounts
 from manyeyes.comms.token_format import MAX_TOKEN_VALUE
 
 TEXT = (Path(__file__).resolve().parents[2] / "docs" / "messages.md").read_text(encoding="utf-8")
@@ -16,6 +16,6 @@ def test_every_reason_is_in_the_table() -> None:
 
 
 def test_the_bounds_are_those_of_the_code() -> None:
-    assert f"beyond ±{MAX_TOKEN_VALUE:g}" in TEXT
+    assert f"at most ±{MAX_TOKEN_VALUE:g}" in TEXT
     assert f"best {LateFusion().max_boxes} of a message" in TEXT and f"within {DUPLICATE_DISTANCE_M:g} m" in TEXT
     assert DISPLACED_SCORE_FACTOR == 0.5 and "half its score" in TEXT

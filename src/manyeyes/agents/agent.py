@@ -167,7 +167,8 @@ class Agent:
 
     def inbox(self, expire_ns: int | None = None) -> Inbox:
         """Return an inbox that accepts only tokens that this agent can fuse."""
-        return Inbox(expire_ns=expire_ns, token_format=self.token_format)
+        limits = self.limits if expire_ns is None else replace(self.limits, max_age_ns=expire_ns)
+        return Inbox(token_format=self.token_format, limits=limits)
 
     def perceive(self, frame: AgentFrame, inbox: Inbox | Iterable[bytes] = (), now_ns: int | None = None) -> Perception:
         """Return boxes around the agent from its own frame and from the messages received so far.
@@ -180,7 +181,7 @@ class Agent:
         """
         now_ns = frame.timestamp_ns if now_ns is None else now_ns
         if not isinstance(inbox, Inbox):
-            packets, inbox = inbox, self.inbox(self.limits.max_age_ns)
+            packets, inbox = inbox, self.inbox()
             for packet in packets:
                 inbox.push(packet, now_ns)
         rejected, received = list(inbox.take_rejections()), list[ReceivedMessage]()

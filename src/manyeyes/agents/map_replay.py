@@ -16,6 +16,7 @@ from manyeyes.agents.map_perception import MapPredictor, encode_map_message
 from manyeyes.agents.map_server import MapServer
 from manyeyes.comms.channel import NS_PER_S, channel_preset
 from manyeyes.comms.inbox import Inbox
+from manyeyes.comms.receiver_limits import ReceiverLimits
 from manyeyes.datatypes import AgentFrame
 
 SERVER_ID = -(2**31)
@@ -59,7 +60,9 @@ class MapReplay:
 
     def __post_init__(self) -> None:
         radio = channel_preset(self.channel)
-        self._features, self._maps = (Exchange(radio, self.seed, lambda _: Inbox(expire_ns=DRAIN_NS)) for _ in range(2))
+        self._features, self._maps = (
+            Exchange(radio, self.seed, lambda _: Inbox(limits=ReceiverLimits(max_age_ns=DRAIN_NS))) for _ in range(2)
+        )
 
     def step(self, frames: Sequence[AgentFrame]) -> tuple[SentRecord, ...]:
         """Replay one instant: share features, predict and send local maps, and ingest them at the server."""

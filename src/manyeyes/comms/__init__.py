@@ -20,10 +20,12 @@ if TYPE_CHECKING:
         Transmission as Transmission,
         channel_preset as channel_preset,
     )
+    from manyeyes.comms.drop_counts import DropCounts as DropCounts
     from manyeyes.comms.entropy import CodeTables as CodeTables
-    from manyeyes.comms.inbox import DropCounts as DropCounts, Inbox as Inbox, ReceivedMessage as ReceivedMessage
+    from manyeyes.comms.inbox import Inbox as Inbox, ReceivedMessage as ReceivedMessage
     from manyeyes.comms.local_bus import LocalBus as LocalBus
     from manyeyes.comms.primitives import PacketError as PacketError
+    from manyeyes.comms.receiver_limits import ReceiverLimits as ReceiverLimits
     from manyeyes.comms.request_map import (
         build_request_map as build_request_map,
         compute_request_weights as compute_request_weights,

@@ -144,7 +144,8 @@ def _read_line(body: bytes, at: int, ring: bool) -> tuple[Ints, int]:
     # Each point takes two bytes or more: what is announced beyond that is not read, hence not made room for.
     if not min_points <= count <= (len(body) - at - used) // 2:
         raise PacketError("garbage", f"A line of {count} points does not lie in {len(body) - at} bytes.")
-    values, more = primitives.unpack_varints(body[at + used :], 2 * int(count))
+    first, max_bytes = at + used, 2 * int(count) * primitives.VARINT_BYTES
+    values, more = primitives.unpack_varints(body[first : first + max_bytes], 2 * int(count))
     steps = (values >> 1 ^ -(values & 1)).reshape(-1, 2)
     line = steps.cumsum(0)
     again = (steps[1:] == 0).all(1).any() or (ring and bool((line[0] == line[-1]).all()))

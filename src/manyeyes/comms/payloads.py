@@ -355,6 +355,11 @@ def read_body(kind: int, body: bytes, fingerprint: bytes, tables: CodeTables | N
     return None
 
 
+def claimed_cells(packet: bytes, at: int) -> int:
+    """Return the number of cells in the head of a body of tokens, which begins at this place; 0 of a truncated one."""
+    return _TOKENS.unpack_from(packet, at + _GRID.size)[2] if len(packet) >= at + TOKENS_BYTES else 0
+
+
 def _rows(body: bytes, dtype: np.dtype[Any]) -> NDArray[Any]:
     if len(body) % dtype.itemsize:
         raise PacketError("garbage", f"Rows of {dtype.itemsize} bytes do not fill a body of {len(body)}.")
@@ -408,8 +413,10 @@ def _read_tokens(body: bytes, fingerprint: bytes, tables: CodeTables | None) -> 
     if layout == _CODED:
         if tables is None or tables.fingerprint != fingerprint:
             raise PacketError("wrong_model", "These tokens are coded by the tables of other weights.")
-        if tables.width != channels or cells > MAX_CODED_CELLS:
-            raise PacketError("implausible", f"Coded rows of {channels} bytes on {cells} cells are not of this model.")
+        if tables.width != channels or cells > MAX_CODED_CELLS or count > cells:
+            raise PacketError(
+                "implausible", f"{count} coded rows of {channels} bytes on {cells} cells are not of this model."
+            )
         key, rows = unpack_coded(data, count, grid.shape, tables)
         return TokenRows(grid, encoding, channels, key, b"", rows.tobytes())
     key, used = primitives.unpack_cells(layout, data, count)

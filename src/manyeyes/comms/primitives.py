@@ -20,8 +20,9 @@ Reason = Literal["garbage", "version", "checksum", "implausible", "contradiction
 DELTA, BITMAP = 0, 1
 """How a set of cells is written: gaps between sorted keys, or one bit a cell over the span of keys."""
 
-_VARINT_BYTES = 5
-_VARINT_LIMITS = 1 << 7 * np.arange(1, _VARINT_BYTES)
+VARINT_BYTES = 5
+"""Most bytes of a varint."""
+_VARINT_LIMITS = 1 << 7 * np.arange(1, VARINT_BYTES)
 _STEPS_PER_OCTAVE = 8
 _FIRST_OCTAVE = -16
 
@@ -41,7 +42,7 @@ def varint_sizes(values: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def pack_varints(values: NDArray[np.int64]) -> bytes:
     """Little-endian base-128 of values (N,) in [0, 2^35): seven bits a byte, the top bit is set if more follow."""
-    out = np.empty(len(values) * _VARINT_BYTES, np.uint8)
+    out = np.empty(len(values) * VARINT_BYTES, np.uint8)
     used = _write_varints(np.ascontiguousarray(values, np.int64), out)
     if used < 0:
         raise WireError("A varint holds values from 0 to 2^35 - 1; send a smaller grid.")
@@ -72,15 +73,22 @@ def _write_varint(value: int, out: U8x1, at: int) -> int:  # pragma: no cover
 
 def unpack_varints(data: bytes, count: int) -> tuple[NDArray[np.int64], int]:
     """Return the first ``count`` varints of data, and how many bytes they took. Padded (non-shortest) forms are refused."""
+    _check_room(count, len(data))
     values = np.zeros(count, np.int64)
     used, whole = _read_varints(np.frombuffer(data, np.uint8), values)
     _check_varints(used, whole, count)
     return values, used
 
 
+def _check_room(count: int, most: int) -> None:
+    """Refuse a count of values that these bytes cannot hold, before anything is allocated for it."""
+    if count > most:
+        raise PacketError("garbage", f"{count} values were announced; the bytes hold {most} at most.")
+
+
 def _check_varints(used: int, whole: int, count: int) -> None:
     if used < 0:
-        raise PacketError("garbage", f"A varint has at most {_VARINT_BYTES} bytes and no padding.")
+        raise PacketError("garbage", f"A varint has at most {VARINT_BYTES} bytes and no padding.")
     if whole < count:
         raise PacketError("garbage", f"Expected {count} varints; the bytes end after {whole}.")
 
@@ -177,9 +185,9 @@ def pack_cells(key: NDArray[np.int64]) -> tuple[int, bytes]:
 
 def pack_cell_runs(key: NDArray[np.int64], counts: list[int]) -> list[tuple[int, bytes]]:
     """:func:`pack_cells` of each run of keys (N,), which ascend within a run; counts: how many keys each run has."""
-    if key.size and (int(key.min()) < 0 or int(key.max()) >> 7 * _VARINT_BYTES):
+    if key.size and (int(key.min()) < 0 or int(key.max()) >> 7 * VARINT_BYTES):
         raise WireError("A varint holds values from 0 to 2^35 - 1; send a smaller grid.")
-    out = np.empty(len(key) * _VARINT_BYTES, np.uint8)
+    out = np.empty(len(key) * VARINT_BYTES, np.uint8)
     layouts, ends = np.empty(len(counts), np.uint8), np.empty(len(counts), np.int64)
     _write_cell_runs(np.ascontiguousarray(key, np.int64), np.array(counts, np.int64), out, layouts, ends)
     data, stops = out.tobytes(), ends.tolist()
@@ -215,6 +223,7 @@ def _write_cell_runs(key: I64x1, counts: I64x1, out: U8x1, layouts: U8x1, ends: 
 
 def unpack_cells(layout: int, data: bytes, count: int) -> tuple[NDArray[np.int64], int]:
     """Return the inverse of :func:`pack_cells`: ascending keys (count,) and how many bytes of data they took."""
+    _check_room(count, len(data) if layout == DELTA else 8 * len(data))
     key, raw = np.empty(count, np.int64), np.frombuffer(data, np.uint8)
     if layout == DELTA:
         used, whole = _read_gaps(raw, key)
@@ -255,6 +264,17 @@ def _read_bitmap(raw: U8x1, start: int, end: int, first: int, key: I64x1) -> int
                     key[marked] = first + 8 * i + bit
                 marked += 1
     return marked
+
+
+@njit(cache=True)
+def mark_new(bitmap: U8x1, key: I64x1) -> bool:  # pragma: no cover
+    """Set the bits of keys (N,) in a bitmap, lowest bit first; nothing is set, and False returned, where one of them is set."""
+    for k in key:
+        if bitmap[k >> 3] >> (k & 7) & 1:
+            return False
+    for k in key:
+        bitmap[k >> 3] |= 1 << (k & 7)
+    return True
 
 
 def are_finite(data: bytes, at: int, size: int) -> bool:

@@ -11,7 +11,7 @@ from manyeyes.datatypes import ConfigError
 
 @dataclass(frozen=True)
 class ReceiverLimits:
-    """Bounds of received packets, of messages, and of poses. Honest senders stay below all of them by a factor of 3 or more.
+    """Bounds of received packets, of messages, and of poses. Honest senders stay below all of them.
 
     A cloud of points (early fusion) is the longest message: lower max_message_bytes where none is expected.
     """
@@ -39,7 +39,6 @@ class ReceiverLimits:
     max_objects: int = 256
     max_points: int = 200_000
     max_map_elements: int = 512
-    max_map_points: int = 8_192
     # Distance of objects, map elements and the edges of a grid from their sender
     max_range_m: float = 300.0
     # Fused at one instant: senders, and tokens of all of them together

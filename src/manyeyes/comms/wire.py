@@ -99,7 +99,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from manyeyes.comms import payloads
+from manyeyes.comms import payloads, primitives
 from manyeyes.comms.entropy import CodeTables
 from manyeyes.comms.map_payload import ElementRows, merge_elements, pack_element_bodies
 from manyeyes.comms.payloads import Body, ObjectRows, PointRows, TokenCodec, TokenEncoding, TokenRows
@@ -121,6 +121,7 @@ _POSITION_UNITS = 1 << 20
 _POSITION_BYTES = 6
 _MAX_POSITION_M = 1e8
 _SIGMA_M, _SIGMA_RAD = (1e-3, 1e4), (1e-5, 10.0)
+_EMPTY_BITMAP = np.zeros(0, np.uint8)
 _SENDING_ORDER = (payloads.OBJECTS, payloads.REQUEST, payloads.TOKENS, payloads.ELEMENTS, payloads.POINTS)
 
 
@@ -330,11 +331,22 @@ def _decode_covariance(covariance_codes: tuple[int, ...]) -> NDArray[np.float64]
     return factor @ factor.T
 
 
-def decode_packet(packet: bytes, tables: CodeTables | None = None) -> Fragment:
-    """Return one packet, checked from its first to its last byte; every fault is a :class:`PacketError` with a reason.
+class Envelope(NamedTuple):
+    """Header of one packet whose checksum matches; its body is not read. number: of the packet; kind: of the body."""
 
-    tables: of the reader's weights, by which coded tokens are read.
-    """
+    header: MessageHeader
+    number: int
+    kind: int
+    packet: bytes
+
+    @property
+    def claimed_cells(self) -> int:
+        """Number of cells that a body of tokens claims to hold; 0 of other kinds."""
+        return payloads.claimed_cells(self.packet, _BODY_AT) if self.kind == payloads.TOKENS else 0
+
+
+def open_packet(packet: bytes) -> Envelope:
+    """Return the header of a packet, checked, its checksum too; every fault is a :class:`PacketError` with a reason."""
     packet = packet if type(packet) is bytes else bytes(memoryview(packet))
     if len(packet) < 3 or packet[:2] != _MAGIC:
         raise PacketError("garbage", f"Not a manyeyes packet: expected the bytes {_MAGIC!r}, got {packet[:2]!r}.")
@@ -351,9 +363,22 @@ def decode_packet(packet: bytes, tables: CodeTables | None = None) -> Fragment:
         raise PacketError("checksum", f"The checksum of a packet with agent id {agent_id} does not match its bytes.")
     if flags >> 6 or number >= count:
         raise PacketError("garbage", f"Contradictory header: flags {flags:#04x}, packet {number} of {count}.")
-    header = _header(common, flags >> 3, count)
-    body = payloads.read_body(flags & 7, packet[_BODY_AT : -_CRC.size], header.fingerprint, tables)
-    return Fragment(header, number, body, packet)
+    return Envelope(_header(common, flags >> 3, count), number, flags & 7, packet)
+
+
+def read_fragment(envelope: Envelope, tables: CodeTables | None = None) -> Fragment:
+    """Return a packet with its body, checked to its last byte; every fault is a :class:`PacketError` with a reason.
+
+    tables: of the reader's weights, by which coded tokens are read.
+    """
+    header, packet = envelope.header, envelope.packet
+    body = payloads.read_body(envelope.kind, packet[_BODY_AT : -_CRC.size], header.fingerprint, tables)
+    return Fragment(header, envelope.number, body, packet)
+
+
+def decode_packet(packet: bytes, tables: CodeTables | None = None) -> Fragment:
+    """Return one packet by :func:`open_packet` and :func:`read_fragment`."""
+    return read_fragment(open_packet(packet), tables)
 
 
 # The packets of a message come one after another, and what they say alike is read once.
@@ -382,6 +407,12 @@ def _quaternion(largest: int, codes: list[int]) -> list[float]:
     return parts
 
 
+def count_bitmap_bytes(grid: BevGrid) -> int:
+    """Return bytes of one bit a cell of a grid."""
+    rows, columns = grid.shape
+    return (rows * columns + 7) // 8
+
+
 class Assembly:
     """The fragments of one message so far, checked against each other as they come."""
 
@@ -392,25 +423,35 @@ class Assembly:
         self._objects: np.dtype[Any] | None = None
         self._has_request = False
         self._rings: bytes | None = None
-        self._cells: set[int] = set()
+        self._cells = _EMPTY_BITMAP
         self.add(first)
+
+    @property
+    def has_content(self) -> bool:
+        """Whether any packet has a section."""
+        return any(fragment.body is not None for fragment in self.fragments.values())
+
+    def has_copy(self, fragment: Fragment) -> bool:
+        """Return whether the packet was added before."""
+        held = self.fragments.get(fragment.number)
+        return held is not None and held.packet == fragment.packet
 
     def add(self, fragment: Fragment) -> bool:
         """Return whether the fragment is new, False where it is a copy; one that contradicts is refused (PacketError)."""
-        head, held = self.header, self.fragments.get(fragment.number)
-        if held is not None and held.packet == fragment.packet:
+        head = self.header
+        if self.has_copy(fragment):
             return False
-        if (fragment.header is not head and fragment.header != head) or held is not None:
+        if (fragment.header is not head and fragment.header != head) or fragment.number in self.fragments:
             name = self._name(fragment)
             raise PacketError("contradiction", f"A second {name} differs from the first; both cannot be true.")
         if isinstance(fragment.body, TokenRows):
             form = (fragment.body.grid, fragment.body.encoding, fragment.body.channels)
-            cells = fragment.body.key.tolist()
-            if (self._token_layout or form) != form or not self._cells.isdisjoint(cells):
+            if self._token_layout is None:
+                self._cells = np.zeros(count_bitmap_bytes(fragment.body.grid), np.uint8)
+            if (self._token_layout or form) != form or not primitives.mark_new(self._cells, fragment.body.key):
                 name = self._name(fragment)
                 raise PacketError("contradiction", f"The cells in {name} do not go with those of the other packets.")
             self._token_layout = form
-            self._cells.update(cells)
         if isinstance(fragment.body, ObjectRows):
             if (self._objects or fragment.body.rows.dtype) != fragment.body.rows.dtype:
                 name = self._name(fragment)
