@@ -4,7 +4,8 @@
 from dataclasses import fields
 from pathlib import Path
 
-from manyeyes.agents.strategies.late import DISPLACED_SCORE_FACTOR, DUPLICATE_DISTANCE_M, LateFusion
+from manyeyes.agents.own_detections import DISPLACED_SCORE_FACTOR, DUPLICATE_DISTANCE_M
+from manyeyes.agents.strategies.late import LateFusion
 from manyeyes.comms.drop_counts import DropCounts
 from manyeyes.comms.token_format import MAX_TOKEN_VALUE
 
