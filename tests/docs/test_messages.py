@@ -4,7 +4,7 @@
 from dataclasses import fields
 from pathlib import Path
 
-from manyeyes.agents.own_detections import DISPLACED_SCORE_FACTOR, DUPLICATE_DISTANCE_M
+from manyeyes.agents.own_detections import DISPLACED_SCORE_FACTOR, SAME_OBJECT_DISTANCE_M
 from manyeyes.agents.strategies.late import LateFusion
 from manyeyes.comms.drop_counts import DropCounts
 from manyeyes.comms.token_format import MAX_TOKEN_VALUE
@@ -18,5 +18,5 @@ def test_every_reason_is_in_the_table() -> None:
 
 def test_the_bounds_are_those_of_the_code() -> None:
     assert f"at most ±{MAX_TOKEN_VALUE:g}" in TEXT
-    assert f"best {LateFusion().max_boxes} of a message" in TEXT and f"within {DUPLICATE_DISTANCE_M:g} m" in TEXT
+    assert f"best {LateFusion().max_boxes} of a message" in TEXT and f"within {SAME_OBJECT_DISTANCE_M:g} m" in TEXT
     assert DISPLACED_SCORE_FACTOR == 0.5 and "half its score" in TEXT
