@@ -19,7 +19,7 @@ import subprocess
 import sys
 from argparse import ArgumentParser
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -135,8 +135,8 @@ class Copy:
     Each run of pytest is a fork of this process, which has imported the large libraries once.
     """
 
-    def __init__(self, root: Path, folder: Path, timeout_s: float) -> None:
-        self.root, self.folder, self.timeout_s = root, folder, timeout_s
+    def __init__(self, root: Path, folder: Path, timeout_s: float, selections: Sequence[str] = (FAST, SLOW)) -> None:
+        self.root, self.folder, self.timeout_s, self.selections = root, folder, timeout_s, selections
         self.passing, self.failing = set[str](), set[str]()
         (folder / ".caches" / "numba").mkdir(parents=True, exist_ok=True)
         words = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
@@ -176,7 +176,7 @@ class Copy:
         path = self.folder / mutation.path
         path.write_bytes(mutation.apply((self.root / mutation.path).read_bytes()))
         try:
-            for selection in (FAST, SLOW):
+            for selection in self.selections:
                 for file in files:
                     words = ["-x", "-m", selection, file, *(f"--deselect={test}" for test in sorted(self.failing))]
                     status, output = self.run_tests(words, cache)
@@ -246,6 +246,7 @@ def main() -> int:
     parser.add_argument(
         "--work", type=Path, help="folder of the copy, kept with its compiled loops; default: temporary"
     )
+    parser.add_argument("--fast", action="store_true", help="run no slow tests")
     parser.add_argument("--list", action="store_true", help="print the draw and run nothing")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -266,7 +267,8 @@ def main() -> int:
     graph = ImportGraph(read, read_sources("tests/**/test_*.py"))
     outcomes: dict[Mutation, Outcome] = {}
     with TemporaryDirectory() as temporary:
-        copy = Copy(ROOT, options.work or Path(temporary), options.timeout_s)
+        selections = (FAST,) if options.fast else (FAST, SLOW)
+        copy = Copy(ROOT, options.work or Path(temporary), options.timeout_s, selections)
         for outcome in run_mutants(copy, chosen, graph, options.files):
             outcomes[outcome.mutation] = outcome
             print(f"{describe(outcome.mutation)}\n    {outcome.killer or 'SURVIVED'}", flush=True)

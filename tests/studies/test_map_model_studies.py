@@ -16,7 +16,7 @@ from manyeyes.cli import main as cli
 from manyeyes.datasets.missing import NONE_MISSING
 from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapElements
-from manyeyes.evaluation.maps.tile_metrics import TileTable
+from manyeyes.evaluation.maps.tile_metrics import TileRow, TileTable
 from manyeyes.evaluation.maps.tile_prediction import (
     CLEAN,
     CLEAN_CORRECTED,
@@ -28,6 +28,7 @@ from manyeyes.evaluation.maps.tile_prediction import (
     ScenarioPredictions,
     TilePrediction,
 )
+from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.models import checkpoint, pretrained
 from manyeyes.models.maps.bev import BevConfig
 from manyeyes.models.maps.head import MapHeadConfig
@@ -252,3 +253,18 @@ def test_missing_or_repeated_options_are_one_line(weights, tmp_path, capsys, mon
     assert "takes one model" in refused("full-map", "--data", tmp_path, "--weights", weights, both)
     trained = save(tmp_path / "taught.safetensors", towns=("Cross",))
     assert "Split by place" in refused("map-pose-noise", "--data", tmp_path, "--weights", trained)
+
+
+def test_a_table_has_the_rows_of_each_set_of_sensors_in_order_and_names_the_missing_ones() -> None:
+    def make_row(name: str) -> TileRow:
+        shown = Interval(0.5, 0.4, 0.6, 0.95, 3)
+        return TileRow(name, 3, ((shown,) * 3,) * 2, (shown,) * 2, (0.5,), 2.0, 100.0, 200.0)
+
+    table = model_study.make_rows_table("t", {"both": [make_row("c")], "LiDAR": [make_row("a"), make_row("b")]})
+    assert [line[:2] for line in table.lines] == [
+        ("LiDAR", "a"),
+        ("LiDAR", "b"),
+        ("camera", model_study.NOT_RUN),
+        ("both", "c"),
+    ]
+    assert {len(line) for line in table.lines} == {len(model_study.HEADINGS)}
