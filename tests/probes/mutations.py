@@ -8,7 +8,9 @@ of drawings (`viz`), and keywords of speed and safety (`UNOBSERVED`).
 from __future__ import annotations
 
 import ast
-import random
+import hashlib
+import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import unified_diff
@@ -162,9 +164,14 @@ class _Finder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_UnaryOp(self, node: ast.UnaryOp) -> None:
+        value = getattr(node.operand, "value", None)
+        if isinstance(node.op, ast.USub) and isinstance(value, int):
+            # No other sign and no -2 for -1: the same axis, size or element, where there are two.
+            self.add(node.operand, "constant", str(value - 1))
+            return
         if isinstance(node.op, ast.Not):
             self.add(node, "removed not", node.operand)
-        elif isinstance(node.op, ast.USub) and not isinstance(getattr(node.operand, "value", None), int):
+        elif isinstance(node.op, ast.USub):
             self.add(node, "sign", node.operand)
         self.generic_visit(node)
 
@@ -216,14 +223,21 @@ def find_mutations(path: str, source: bytes) -> list[Mutation]:
 
 
 def draw_mutations(sources: Mapping[str, bytes], count: int, seed: int) -> list[Mutation]:
-    """Draw different mutations: a file in proportion to its statements, a statement of it, a mutation of that."""
-    generator = random.Random(seed)
-    found = {path: find_mutations(path, source) for path, source in sorted(sources.items())}
-    paths = [path for path, mutations in found.items() if mutations]
-    weights = [sum(isinstance(n, ast.stmt) for n in ast.walk(ast.parse(sources[path]))) for path in paths]
-    drawn: dict[Mutation, None] = {}
-    while len(drawn) < min(count, sum(map(len, found.values()))):
-        (path,) = generator.choices(paths, weights)
-        line = generator.choice(sorted({m.lines[0] for m in found[path]}))
-        drawn[generator.choice([m for m in found[path] if m.lines[0] == line])] = None
-    return list(drawn)
+    """Draw mutations: files in proportion to their statements, in a file each statement alike, in a statement each mutation.
+
+    A mutation is drawn by a hash of the seed, its path and its line, so that other changes of the source leave most of a draw as
+    it is (weighted sampling without replacement, Efraimidis and Spirakis, 2006).
+    """
+    keyed: list[tuple[float, Mutation]] = []
+    for path, source in sorted(sources.items()):
+        found, lines = find_mutations(path, source), source.splitlines()
+        num_statements = sum(isinstance(node, ast.stmt) for node in ast.walk(ast.parse(source)))
+        per_statement, seen = Counter(m.lines[0] for m in found), Counter[str]()
+        for mutation in found:
+            name = repr((seed, path, mutation.operator, mutation.replacement, lines[mutation.lines[1] - 1].strip()))
+            seen[name] += 1
+            digest = hashlib.sha256(f"{name}{seen[name]}".encode()).digest()
+            uniform = (int.from_bytes(digest[:8], "big") + 1) / 2**64
+            weight = num_statements / len(per_statement) / per_statement[mutation.lines[0]]
+            keyed.append((math.log(uniform) / weight, mutation))
+    return [mutation for _, mutation in sorted(keyed, key=lambda pair: -pair[0])[:count]]
