@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -418,6 +419,16 @@ def test_one_trusted_roadside_unit_publishes_and_its_pose_is_fixed():
     assert abs(pose.pose[pose.row_indices([car.id])[0], 1]) < 0.1
     assert len(fuse([pole, replace(pole, time_ns=pole.time_ns + HOUR)]).select_published()) == 4
     assert len(fuse([car]).select_published()) == 0
+
+
+def test_one_observation_of_a_trusted_unit_publishes_its_confident_elements():
+    pole = make_observation(road(), (30.0, 0.0, 0.0), "pole", trusted=True)
+    fused = fuse([pole])
+    assert len(fused) == len(fused.select_published()) == 4
+    assert fused.log_odds == pytest.approx(math.log(0.7 / 0.05)) and (fused.elements.score < 1.0).all()
+    assert len(fuse([replace(pole, trusted=False)]).select_published()) == 0
+    unsure = pole.elements.score * 0.0 + 0.6
+    assert len(fuse([replace(pole, elements=replace(pole.elements, score=unsure))]).select_published()) == 0
 
 
 def test_nothing_gives_nothing():

@@ -65,6 +65,13 @@ def test_a_map_is_built_from_an_empty_one():
     assert len(fused) == 5 and compute_map_fscore(fused, fuse(make_observations(3, 0.0))) > 0.95
 
 
+def test_one_observation_of_a_trusted_unit_is_published_at_once():
+    for trusted, published in ((True, 5), (False, 0)):
+        live = IncrementalMap(VectorMap.empty())
+        live.update(replace(make_observations(1)[0], trusted=trusted))
+        assert len(live.build_map().select_published()) == published
+
+
 def test_an_observation_counts_once():
     observations = make_observations(5)
     live = IncrementalMap(fuse(observations))

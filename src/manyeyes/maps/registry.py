@@ -18,6 +18,7 @@ from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.observation_file import find_observation_files, read_observations
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.fusion.fuse import MapFusionConfig, fuse
+from manyeyes.maps.isolation import IsolatedFailure, isolate_failures
 
 OURS = "manyeyes"
 FuseFunction = Callable[[Sequence[Observation], Any, MapFrame | None], VectorMap]
@@ -94,3 +95,17 @@ def fuse_maps(
             raise ConfigError(f"{observations} holds no usable observation; 'manyeyes map simulate' makes some.")
         observations, frame = loaded.observations, loaded.frame
     return chosen.fuse(observations, chosen.config_class() if config is None else config, frame)
+
+
+def fuse_isolated(
+    observations: Sequence[Observation], method: str, config: Any, frame: MapFrame
+) -> tuple[VectorMap, tuple[IsolatedFailure, ...]]:
+    """Fuse observations into one map, without those that make the method fail; see :func:`fuse_maps` for the arguments.
+
+    Returns:
+        The map, and rows of the observations that were left out, with the error of each.
+    """
+    fuse_method = MAP_FUSION_METHODS.get(method).fuse
+    return isolate_failures(
+        lambda rows: fuse_method([observations[row] for row in rows], config, frame), len(observations)
+    )

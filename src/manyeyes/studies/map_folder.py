@@ -96,11 +96,24 @@ def report_rejected(rejected: Sequence[RejectedRows], console: Console) -> None:
 
 
 def write_vector_map(vector_map: VectorMap, folder: Path) -> None:
-    """A map as a folder of two GeoParquet files: GeoArrow columns hold lines or polygons, not both."""
+    """A map as a folder of two GeoParquet files: GeoArrow columns hold lines or polygons, not both.
+
+    They replace a former map without a moment at which lines of one map stand beside crossings of the other.
+    """
+    from manyeyes._io import UNFINISHED, atomic_rename
     from manyeyes.maps.formats.geoparquet import write_map
 
     folder.mkdir(parents=True, exist_ok=True)
-    write_map(vector_map, folder / LINES_FILE, folder / CROSSINGS_FILE)
+    files = [folder / LINES_FILE, folder / CROSSINGS_FILE]
+    drafts = [file.with_name(f".{file.name}{UNFINISHED}") for file in files]
+    try:
+        write_map(vector_map, drafts[0], drafts[1])
+        files[1].unlink(missing_ok=True)
+        for draft, file in zip(drafts, files):
+            atomic_rename(draft, file)
+    finally:
+        for draft in drafts:
+            draft.unlink(missing_ok=True)
 
 
 def read_vector_map(folder: Path) -> VectorMap:
@@ -116,6 +129,7 @@ def read_vector_map(folder: Path) -> VectorMap:
     missing = [file.name for file in files if not file.is_file()]
     if missing:
         raise ConfigError(
-            f"{folder}: expected a store, or a map's folder with {LINES_FILE} and {CROSSINGS_FILE}; {missing[0]} is missing."
+            f"{folder}: expected a store, or a map's folder with {LINES_FILE} and {CROSSINGS_FILE}; {missing[0]} is missing. "
+            "Make the map again with 'manyeyes map fuse'."
         )
     return read_map(*files)

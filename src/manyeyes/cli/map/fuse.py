@@ -44,9 +44,10 @@ def main(options: Options) -> None:
 
     from rich.console import Console
 
-    from manyeyes.maps.registry import MAP_FUSION_METHODS, fuse_maps
+    from manyeyes.maps.isolation import reject_failed
+    from manyeyes.maps.registry import MAP_FUSION_METHODS, fuse_isolated
     from manyeyes.studies import provenance
-    from manyeyes.studies.map_folder import load_observations, write_vector_map
+    from manyeyes.studies.map_folder import load_observations, report_rejected, write_vector_map
 
     config = MAP_FUSION_METHODS.get(options.method).config_class()
     console = Console()
@@ -58,13 +59,18 @@ def main(options: Options) -> None:
     out = options.out or base / ("map" if options.method == "manyeyes" else options.method)
     start = time.perf_counter()
     with console.status(f"Fusing {len(loaded.observations)} observations"):
-        fused = fuse_maps(loaded.observations, options.method, config, loaded.frame)
+        fused, failures = fuse_isolated(loaded.observations, options.method, config, loaded.frame)
     seconds = time.perf_counter() - start
+    failed = [reject_failed(str(options.observations), loaded.observations[one.row], one.reason) for one in failures]
+    report_rejected(failed, console)
+    rejected = (*loaded.rejected, *failed)
+    num_fused = len(loaded.observations) - len(failed)
     write_vector_map(fused, out)
     published = len(fused.select_published())
     payload = {
-        "observations": len(loaded.observations),
-        "rejected": len(loaded.rejected),
+        "observations": num_fused,
+        "rejected": len(rejected),
+        "quarantine": rejected,
         "elements": len(fused),
         "published": published,
         "hash": fused.quantised_hash(),
@@ -72,7 +78,7 @@ def main(options: Options) -> None:
     }
     provenance.write_json(out / "fuse.json", payload, {"options": options, "settings": config}, None)
     console.print(
-        f"{out}: {published} published elements of {len(fused)} from {len(loaded.observations)} observations in {seconds:.1f} s",
+        f"{out}: {published} published elements of {len(fused)} from {num_fused} observations in {seconds:.1f} s",
         highlight=False,
         soft_wrap=True,
     )
@@ -80,9 +86,10 @@ def main(options: Options) -> None:
 
 def _fuse_into_store(options: Options, folder: Path, console: Console) -> None:
     """Takes the observations into a store's log and publishes a release, tile by tile."""
-    from manyeyes.maps.elements.observation_file import find_observation_files, read_observations
+    from manyeyes.maps.elements.observation_file import RejectedRows, find_observation_files, read_observations
     from manyeyes.maps.store.executors import make_executor
     from manyeyes.maps.store.store import MapStore
+    from manyeyes.studies import provenance
     from manyeyes.studies.map_folder import report_rejected
 
     if options.method != "manyeyes":
@@ -92,9 +99,20 @@ def _fuse_into_store(options: Options, folder: Path, console: Console) -> None:
     store = MapStore(folder) if store_exists else MapStore.create(folder, read_observations(source).frame)
     with store.open_for_writing() as log:
         ingested = log.ingest(source)
-    rejected = (*log.rejected, *ingested.rejected)
-    report_rejected(rejected, console)
+    known = len(log.rejected)
+    report_rejected((*log.rejected, *ingested.rejected), console)
     number = publish_release(store, executor, console)
+    report_rejected(log.rejected[known:], console)
+    rejected = (*log.rejected, *ingested.rejected)
+    payload = {
+        "release": number,
+        "observations": store.manifest(number).watermark.observations,
+        "added": ingested.num_added,
+        "known": ingested.num_known,
+        "rejected": len(rejected),
+        "quarantine": [RejectedRows(*row) for row in log.index.list_rejected()],
+    }
+    provenance.write_json(folder / "fuse.json", payload, {"options": options}, None)
     console.print(
         f"{folder}: release {number} after {ingested.num_added} new observations, {ingested.num_known} known, "
         f"{len(rejected)} rejected",

@@ -67,7 +67,9 @@ def main(options: Options) -> None:
     if last is not None and last.watermark == compute_watermark(active.ids, active.time_ns):
         print_status(f"release {last.number} is already without them")
     elif options.fuse:
+        known = len(log.rejected)
         print_status(f"release {publish_release(store, executor, console)} is without them")
+        report_rejected(log.rejected[known:], console)
     else:
         print_status(
             "no new release; run this again without --no-fuse, or 'manyeyes map fuse OBSERVATIONS --store' this folder"

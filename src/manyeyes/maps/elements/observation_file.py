@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
@@ -94,20 +95,23 @@ def find_observation_files(path: Path) -> Path:
 
 
 def read_observations(source: Path | str, frame: MapFrame | None = None) -> LoadedObservations:
-    """Read a file, or every ``*.parquet`` of a folder by name; without a frame, the first file that states one decides."""
+    """Read a file, or every ``*.parquet`` of a folder by name.
+
+    frame: of the poses; without it that of most files, of those of most rows if files are even. Files about another are rejected.
+    """
     source = Path(source)
     files = sorted(source.glob("*.parquet")) if source.is_dir() else [source]
     if not files or not files[0].exists():
         raise ObservationError(f"{source}: expected a Parquet file of observations or a folder of them; found none.")
     kept: list[Observation] = []
     rejected: list[RejectedRows] = []
+    frame = frame or _find_common_frame(files)
     for file in files:
         try:
-            stored, groups = _open(file, frame)
+            groups = _iterate_file_rows(_open(file, frame))
         except ObservationError as error:
             rejected.append(RejectedRows(str(file), -1, 1, str(error)))
             continue
-        frame = frame or stored
         for row, item in groups:
             if isinstance(item, Observation):
                 kept.append(item)
@@ -187,22 +191,43 @@ def iterate_rows(table: pa.Table) -> Iterator[Observation | InvalidRow]:
             yield columns.make_invalid_row(row, str(error))
 
 
-def _open(
-    file: Path, expected: MapFrame | None
-) -> tuple[MapFrame, Iterator[tuple[int, Observation | tuple[int, str]]]]:
-    """Return the frame that a file states and its rows; raises ObservationError where the file as a whole cannot be used."""
+def _find_common_frame(files: Sequence[Path]) -> MapFrame | None:
+    """Return the frame that most files state; None where no file can be used."""
+    votes: dict[MapFrame, tuple[int, int]] = {}
+    for file in files:
+        with contextlib.suppress(ObservationError):
+            opened = _open(file, None)
+            stated = _read_frame(file, opened.schema_arrow.metadata or {})
+            frame = next((known for known in votes if _is_same(known, stated)), stated)
+            num_files, num_rows = votes.get(frame, (0, 0))
+            votes[frame] = num_files + 1, num_rows + opened.metadata.num_rows
+    return max(votes, key=votes.__getitem__, default=None)
+
+
+def _open(file: Path, expected: MapFrame | None) -> Any:
+    """Open a Parquet file; raises ObservationError where the file as a whole cannot be used, as with another frame."""
     pa, pq = _pyarrow(), _parquet()
     try:
         opened = pq.ParquetFile(file, page_checksum_verification=True)
     except (pa.ArrowException, OSError) as error:
         raise ObservationError(f"{file}: expected a whole Parquet file; got {_line(error)}. Fetch it again.") from error
-    frame = _read_frame(file, opened.schema_arrow.metadata or {}, expected)
+    frame = _read_frame(file, opened.schema_arrow.metadata or {})
+    if expected is not None and not _is_same(frame, expected):
+        raise ObservationError(
+            f"{file}: origin: expected latitude {expected.latitude}, longitude {expected.longitude} as asked or as in most "
+            f"files; got {frame.latitude}, {frame.longitude}. Reproject the poses."
+        )
     missing = [name for name in _REQUIRED if name not in opened.schema_arrow.names]
     if missing:
         raise ObservationError(
             f"{file}: expected the columns of docs/maps/observation.md; {', '.join(missing)} missing."
         )
-    return frame, _iterate_file_rows(opened)
+    return opened
+
+
+def _is_same(one: MapFrame, other: MapFrame) -> bool:
+    """Return whether two frames have one origin."""
+    return max(abs(one.latitude - other.latitude), abs(one.longitude - other.longitude)) <= _SAME_DEGREES
 
 
 def _iterate_file_rows(opened: Any) -> Iterator[tuple[int, Observation | tuple[int, str]]]:
@@ -219,7 +244,7 @@ def _iterate_file_rows(opened: Any) -> Iterator[tuple[int, Observation | tuple[i
         start += count
 
 
-def _read_frame(file: Path, stored: dict[bytes, bytes], expected: MapFrame | None) -> MapFrame:
+def _read_frame(file: Path, stored: dict[bytes, bytes]) -> MapFrame:
     """Return the frame in a file's metadata, once format, version and CRS are known to be ours."""
     try:
         metadata = json.loads(stored[METADATA_KEY])
@@ -240,14 +265,7 @@ def _read_frame(file: Path, stored: dict[bytes, bytes], expected: MapFrame | Non
         raise ObservationError(
             f"{file}: crs: expected '{CRS}' about an origin in EPSG:4326; got {crs!r} about {geographic!r}. Reproject the poses."
         )
-    if expected is None:
-        return frame
-    if max(abs(frame.latitude - expected.latitude), abs(frame.longitude - expected.longitude)) > _SAME_DEGREES:
-        raise ObservationError(
-            f"{file}: origin: expected latitude {expected.latitude}, longitude {expected.longitude} as asked or as in the "
-            f"files before; got {frame.latitude}, {frame.longitude}. Reproject the poses."
-        )
-    return expected
+    return frame
 
 
 class _ObservationColumns:

@@ -3,7 +3,8 @@
 
 A station gains log(P_D / P_FA) for an observation that has a line at it, times a weight from the detection score. It loses
 visibility times log((1 - P_FA) / (1 - P_D)) for an observation that covers it without a line. A line at a small lateral offset
-counts as neither. The change per agent and day is bounded, so that no single agent decides. States change with hysteresis.
+counts as neither. The change per agent and day is bounded, so that no single agent decides. A surveyed pole is an exception: it
+has a lower P_FA, no bound per day, and its detection alone can publish a station. States change with hysteresis.
 Misses before the first detection count too, but only down to ``-max_log_odds_before_detection``: one detection after many
 misses is more likely false than new, while a few detections that agree still suffice.
 """
@@ -37,11 +38,12 @@ UNMATCHED, MATCHED, NEARBY = 0, 1, 2
 class EvidenceParameters(NamedTuple):
     """The values of EvidenceConfig as compiled loops read them; metres; min_cosine: cosine of the heading gate.
 
-    hit, miss: change of log-odds. max_log_odds: bound of their absolute value; max_initial_log_odds: before the first
+    hit, trusted_hit, miss: change of log-odds. max_log_odds: bound of their absolute value; max_initial_log_odds: before the first
     detection. min_publish_agents, min_retire_agents: distinct agents.
     """
 
     hit: float
+    trusted_hit: float
     miss: float
     max_log_odds: float
     max_daily_change: float
@@ -63,7 +65,8 @@ class EvidenceParameters(NamedTuple):
 class EvidenceConfig:
     """Detection model and thresholds of the existence estimate.
 
-    detection_prob, false_alarm_prob: P_D and P_FA.
+    detection_prob, false_alarm_prob: P_D and P_FA. trusted_false_alarm_prob: P_FA of a surveyed pole, whose one detection of full
+        weight exceeds the thresholds of publication; on Town07 5 % of such detections with scores from 0.5 are false.
     max_log_odds: bound of |log-odds|; max_log_odds_before_detection: bound of negative log-odds before the first detection.
     max_daily_change: bound of the change by one agent in a day.
     score_low, score_high: scores at which a detection has weight 0 and 1; linear in between.
@@ -80,6 +83,7 @@ class EvidenceConfig:
 
     detection_prob: float = 0.7
     false_alarm_prob: float = 0.15
+    trusted_false_alarm_prob: float = 0.05
     max_log_odds: float = 6.0
     max_log_odds_before_detection: float = 2.0
     max_daily_change: float = 2.0
@@ -101,10 +105,11 @@ class EvidenceConfig:
     kernel_m: float = 0.5
     bias_sigma_m: float = 0.05
 
-    @property
-    def log_odds_hit(self) -> float:
-        """The change of log-odds by a detection."""
-        return float(np.log(self.detection_prob / self.false_alarm_prob))
+    def log_odds_hit(self, trusted: bool = False) -> float:
+        """Return the change of log-odds by a detection of full weight; trusted: of a surveyed pole."""
+        return float(
+            np.log(self.detection_prob / (self.trusted_false_alarm_prob if trusted else self.false_alarm_prob))
+        )
 
     def score_weight(self, score: Floats) -> Floats:
         """Compute the weight (E,) in [0, 1] of detections with these scores."""
@@ -123,7 +128,8 @@ class EvidenceConfig:
     def kernel_params(self) -> EvidenceParameters:
         """The configuration as compiled loops read it."""
         return EvidenceParameters(
-            hit=self.log_odds_hit,
+            hit=self.log_odds_hit(),
+            trusted_hit=self.log_odds_hit(trusted=True),
             miss=self.log_odds_miss,
             max_log_odds=float(self.max_log_odds),
             max_daily_change=float(self.max_daily_change),
@@ -612,7 +618,8 @@ def update_existence(
         started, then = True, time_ns[o]
         a = int(agent[o])
         _open_day(scratch, a, k, int(time_ns[o] // DAY_NS))
-        change = params.hit * score_weight[o] if is_hit else params.miss * seen
+        hit = params.trusted_hit if trusted[o] else params.hit
+        change = hit * score_weight[o] if is_hit else params.miss * seen
         if not trusted[o]:
             change = _bound_daily_change(scratch, a, change, params.max_daily_change)
         floor = -max_log_odds if is_hit else floor

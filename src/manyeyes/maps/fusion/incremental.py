@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, njit
 from manyeyes.datatypes.map_element import CROSSING, KINDS, STYLES, MapElements, take_rows
 from manyeyes.maps.elements.observation import Observation
-from manyeyes.maps.elements.vector_map import PUBLISHED, RETIRED, VectorMap
+from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED, VectorMap
 from manyeyes.maps.fusion.coarse_search import DrawnPoints, apply_shifts, find_best_shifts, to_searched_observations
 from manyeyes.maps.fusion.coverage import find_cells_under_lines, find_observed_cells, merge_runs
 from manyeyes.maps.fusion.crossings import compute_convex_hull, compute_overlap
@@ -221,7 +221,7 @@ class IncrementalMap:
             best = max(shares, default=0.0)
             if best >= config.polygon.min_overlap:
                 is_matched = [u or share >= config.polygon.min_overlap for u, share in zip(is_matched, shares)]
-                amount = config.evidence.log_odds_hit * float(score_weight[int(np.argmax(shares))])
+                amount = config.evidence.log_odds_hit(bool(s.trusted[0])) * float(score_weight[int(np.argmax(shares))])
                 self._rings.add_log_odds(np.array([k]), amount, s, True, self.config)
                 confirmed += 1
             elif best <= 0.05:
@@ -338,8 +338,10 @@ class _EvidenceRows(NamedTuple):
     ) -> _EvidenceRows:
         """Append rows that an observation creates: their kinds (N,) and the weights of the detections (N,)."""
         evidence, time, count = config.fusion.stations.evidence, int(s.time_ns[0]), len(kind)
-        odds = np.minimum(evidence.log_odds_hit * score_weight, evidence.max_daily_change)
-        state = np.where(bool(s.trusted[0]) & (odds >= evidence.publish_threshold(kind)), PUBLISHED, 0)
+        trusted = bool(s.trusted[0])
+        limit = evidence.max_log_odds if trusted else evidence.max_daily_change
+        odds = np.minimum(evidence.log_odds_hit(trusted) * score_weight, limit)
+        state = np.where(trusted & (odds >= evidence.publish_threshold(kind)), PUBLISHED, CANDIDATE)
         one = np.ones(count, np.int64)
         columns = {
             "sigma": np.full(count, 0.3),
@@ -514,7 +516,7 @@ class _StationGrid:
         hit = mass > 0.0
         rows = near[hit]
         gain = mass[hit] / (mass[hit] + 1.0 / np.maximum(self.rows.evidence.sigma[rows], 0.02) ** 2 * 0.04)
-        self.rows.add_log_odds(rows, evidence.log_odds_hit * score_weight[hit], s, True, config)
+        self.rows.add_log_odds(rows, evidence.log_odds_hit(bool(s.trusted[0])) * score_weight[hit], s, True, config)
         normal = np.stack((-self.tangent[rows, 1], self.tangent[rows, 0]), 1)
         self.xy[rows] += (gain * place[hit])[:, None] * normal
         self.rows.evidence.sigma[rows] = np.maximum(

@@ -12,17 +12,22 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
-from manyeyes.datatypes import ConfigError, MissingExtraError
+from manyeyes.datatypes import ConfigError, ManyeyesError, MissingExtraError
 
 B = TypeVar("B")
 R = TypeVar("R")
 
 #: Called after each finished block with (finished, all).
 Progress = Callable[[int, int], None]
+
+
+class WorkerLostError(ManyeyesError):
+    """A worker process ended before it returned its result."""
 
 
 class ExecutorSession(Protocol):
@@ -102,7 +107,13 @@ class _ProcessSession:
                 next_block += 1
             done, _ = wait(in_flight, return_when=FIRST_COMPLETED)
             for future in done:
-                yield in_flight.pop(future), future.result()
+                try:
+                    result = future.result()
+                except BrokenProcessPool as error:
+                    raise WorkerLostError(
+                        "A worker process ended, probably out of memory; run again with fewer --workers: finished steps are kept."
+                    ) from error
+                yield in_flight.pop(future), result
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ The files of the log are authoritative; the index contains nothing that cannot b
 from __future__ import annotations
 
 import contextlib
+import errno
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_VERSION = 2
+_VERSION = 3
 _SCHEMA = {
     "entries": "(name TEXT PRIMARY KEY, rows INTEGER NOT NULL) WITHOUT ROWID",
     "observations": """(
@@ -28,6 +29,8 @@ _SCHEMA = {
     ) WITHOUT ROWID""",
     # Rows of segments that are outside the limits; each is in the quarantine too, with its reason.
     "refused": "(id BLOB PRIMARY KEY, agent TEXT NOT NULL, pass_id TEXT NOT NULL) WITHOUT ROWID",
+    # Observations with which the fusion failed; each is in the quarantine too, with its reason.
+    "failed": "(id BLOB PRIMARY KEY) WITHOUT ROWID",
     "retracted": "(id BLOB PRIMARY KEY, reason TEXT NOT NULL) WITHOUT ROWID",
     "quarantine": "(entry TEXT, file TEXT, row INTEGER, count INTEGER, reason TEXT)",
     # The limits that the segments were checked against when they were indexed.
@@ -87,12 +90,25 @@ class LogIndex:
 
     @contextmanager
     def _open(self) -> Iterator[sqlite3.Connection]:
-        """A connection whose changes are kept together when the block ends well, and not at all when it does not."""
-        with contextlib.closing(sqlite3.connect(self.path, timeout=60.0)) as db:
-            db.execute("PRAGMA journal_mode = WAL")
-            db.execute("PRAGMA synchronous = FULL")
-            with db:
-                yield db
+        """A connection whose changes are kept together when the block ends well, and not at all when it does not.
+
+        Raises:
+            OSError: the index cannot be read or written, as on a full disk; the log is complete without it.
+        """
+        try:
+            with contextlib.closing(sqlite3.connect(self.path, timeout=60.0)) as db:
+                db.execute("PRAGMA journal_mode = WAL")
+                db.execute("PRAGMA synchronous = FULL")
+                with db:
+                    yield db
+        except sqlite3.OperationalError as error:
+            raise OSError(
+                errno.EIO, f"{error}; free space or mend permissions, then run again", str(self.path)
+            ) from error
+        except sqlite3.DatabaseError as error:
+            raise OSError(
+                errno.EIO, f"{error}; delete this file: it is rebuilt from the log", str(self.path)
+            ) from error
 
     def is_current(self, limits: str) -> bool:
         """Tell whether the index has this version's tables and was made under these limits."""
@@ -174,10 +190,13 @@ class LogIndex:
             db.executemany("INSERT OR IGNORE INTO retracted VALUES (?, ?)", values)
             db.execute("INSERT OR REPLACE INTO entries VALUES (?, ?)", (name, len(values)))
 
-    def add_rejected(self, name: str, rows: Iterable[tuple[str, int, int, str]]) -> None:
-        """Index what an ingest rejected: file, row, count, reason."""
+    def add_rejected(
+        self, name: str, rows: Iterable[tuple[str, int, int, str]], failed_ids: Iterable[str] = ()
+    ) -> None:
+        """Index what an ingest or a fusion rejected: file, row, count, reason; failed_ids: observations that count no more."""
         values = [(name, *row) for row in rows]
         with self._open() as db:
+            db.executemany("INSERT OR IGNORE INTO failed VALUES (?)", [(bytes.fromhex(one),) for one in failed_ids])
             db.executemany("INSERT INTO quarantine VALUES (?, ?, ?, ?, ?)", values)
             db.execute("INSERT OR REPLACE INTO entries VALUES (?, ?)", (name, len(values)))
 
@@ -191,7 +210,7 @@ class LogIndex:
         with self._open() as db:
             rows = db.execute(
                 "SELECT id, segment, row_group, time_ns, x, y, reach_m FROM observations "
-                "WHERE id NOT IN (SELECT id FROM retracted) ORDER BY id"
+                "WHERE id NOT IN (SELECT id FROM retracted) AND id NOT IN (SELECT id FROM failed) ORDER BY id"
             ).fetchall()
         segments = tuple(sorted({row[1] for row in rows}))
         number = {name: k for k, name in enumerate(segments)}

@@ -36,6 +36,7 @@ from manyeyes.maps.elements.observation_file import (
     read_observations,
 )
 from manyeyes.maps.elements.observation_limits import LIMITS
+from manyeyes.maps.isolation import FailedObservation, reject_failed
 from manyeyes.maps.store.log_index import ActiveObservations, IndexRow, InvalidEntry, LogIndex
 
 _parquet = partial(import_extra, "pyarrow.parquet", "map", "A log of observations")
@@ -62,7 +63,8 @@ class IngestResult:
 class ObservationLog:
     """The log in a folder; frame: of all its poses.
 
-    rejected: rows of segments that were found to be outside the limits since this object was made; the catalogue lists all.
+    rejected: observations of segments that were found to be outside the limits, or with which a fusion failed, since this object
+        was made; the index lists all.
     """
 
     def __init__(self, folder: Path, frame: MapFrame) -> None:
@@ -86,12 +88,28 @@ class ObservationLog:
         reading = read_observations(source, self.frame)
         added, known = self.append(reading.observations)
         if reading.rejected:
-            rows = [[q.file, q.row, q.count, q.reason] for q in reading.rejected]
-            text = json.dumps({"quarantined": rows}, indent=1).encode()
-            path = self.folder / self._name(hashlib.blake2b(text, digest_size=8).hexdigest(), "quarantine.json")
-            atomic_write(path, text)
-            self._index(path)
+            self._append_quarantine(reading.rejected)
         return IngestResult(added, known, reading.rejected)
+
+    def quarantine(self, failures: Sequence[FailedObservation]) -> tuple[RejectedRows, ...]:
+        """Append that the fusion fails with these observations, which count no more; returns a record of each."""
+        active = self.active_observations()
+        rows = np.array([active.ids.index(one.id) for one in failures], np.int64)
+        stored = {o.id: o for o in read_active(self.folder, active, rows)}
+        rejected = tuple(
+            reject_failed(str(self.folder / active.segments[active.segment[row]]), stored[one.id], one.reason)
+            for row, one in zip(rows.tolist(), failures)
+        )
+        self._append_quarantine(rejected, [one.id for one in failures])
+        self.rejected += rejected
+        return rejected
+
+    def _append_quarantine(self, rejected: Sequence[RejectedRows], failed_ids: Sequence[str] = ()) -> None:
+        rows = [[q.file, q.row, q.count, q.reason] for q in rejected]
+        text = json.dumps({"quarantined": rows, "failed": list(failed_ids)}, indent=1).encode()
+        path = self.folder / self._name(hashlib.blake2b(text, digest_size=8).hexdigest(), "quarantine.json")
+        atomic_write(path, text)
+        self._index(path)
 
     def append(self, observations: Sequence[Observation]) -> tuple[int, int]:
         """Append those that are not there yet as one segment: (added, known)."""
@@ -186,7 +204,8 @@ class ObservationLog:
         if path.name.endswith(".retract.json"):
             self.index.add_retraction(path.name, content["retracted"], content["reason"])
         elif path.name.endswith(".quarantine.json"):
-            self.index.add_rejected(path.name, [tuple(row) for row in content["quarantined"]])
+            rows = [tuple(row) for row in content["quarantined"]]
+            self.index.add_rejected(path.name, rows, content.get("failed", ()))
         else:
             raise StoreError(f"{path}: no entry of a log of observations; move the file elsewhere.")
 

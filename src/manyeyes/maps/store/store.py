@@ -34,6 +34,7 @@ from manyeyes.maps.elements.observation import MapFrame
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.formats.geoparquet import read_map, write_map
 from manyeyes.maps.fusion.fuse import MapFusionConfig
+from manyeyes.maps.isolation import FailedObservationsError
 from manyeyes.maps.store.executors import Executor
 from manyeyes.maps.store.map_diff import (
     MapDelta,
@@ -165,13 +166,21 @@ class MapStore:
         executor: Executor | None = None,
         progress: StepProgress | None = None,
     ) -> Manifest:
-        """Fuse all observations that count and publish the map; steps done before a kill, or for a former release, are reused."""
+        """Fuse all observations that count and publish the map; steps done before a kill, or for a former release, are reused.
+
+        Observations with which the fusion fails go to the quarantine, ``log.rejected``, and the rest is fused.
+        """
         config, tile_config = config or MapFusionConfig(), tile_config or TiledFusionConfig()
         work = self.folder / "work"
         with self.open_for_writing() as log:
-            active = log.active_observations()
             work.mkdir(exist_ok=True)
-            fused = fuse_tiles(log.folder, active, self.frame, work, config, tile_config, executor, progress)
+            while True:
+                active = log.active_observations()
+                try:
+                    fused = fuse_tiles(log.folder, active, self.frame, work, config, tile_config, executor, progress)
+                    break
+                except FailedObservationsError as error:
+                    log.quarantine(error.failures)
             watermark = compute_watermark(active.ids, active.time_ns)
             return self._publish(fused, ALGORITHM, repr(config), watermark)
 

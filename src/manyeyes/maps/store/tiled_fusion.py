@@ -29,6 +29,7 @@ from manyeyes.maps.fusion.fuse import MapFusionConfig, assemble_map
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays, to_observation_arrays
 from manyeyes.maps.fusion.pose_optimization import PoseSolution, merge_solutions, run_step, search_coarse_poses
 from manyeyes.maps.fusion.stations import Area, StationTable, build_stations
+from manyeyes.maps.isolation import CONTENT_ERRORS, FailedObservation, FailedObservationsError, isolate_failures
 from manyeyes.maps.store.executors import Executor, ExecutorSession, ProcessExecutor, map_blocks
 from manyeyes.maps.store.log_index import ActiveObservations
 from manyeyes.maps.store.observation_log import TILE_M, StoreError, read_active, tile_indices
@@ -122,17 +123,30 @@ def fuse_tiles(
     executor: Executor | None = None,
     progress: StepProgress | None = None,
 ) -> VectorMap:
-    """Fuse the observations of the log that ``active`` lists; all workers can access ``log_folder`` and ``work_folder``."""
+    """Fuse the observations of the log that ``active`` lists; all workers can access ``log_folder`` and ``work_folder``.
+
+    Raises:
+        FailedObservationsError: the fusion fails with some observations; without them it may succeed.
+    """
     config = config or MapFusionConfig()
-    blocks = make_blocks(log_folder, active, work_folder, config, tile_config)
     used: set[str] = set()
     with (executor or ProcessExecutor()).open() as runner:
-        tables = _run_steps(blocks, config, runner, progress, used)
+
+        def fuse_rows(rows: Sequence[int]) -> VectorMap:
+            chosen = active if len(rows) == len(active) else _select_active(active, np.array(rows, np.int64))
+            blocks = make_blocks(log_folder, chosen, work_folder, config, tile_config)
+            used.clear()
+            tables = _run_steps(blocks, config, runner, progress, used)
+            return assemble_map(StationTable.cat(tables), config, frame) if tables else VectorMap.empty(frame)
+
+        fused, failures = isolate_failures(fuse_rows, len(active))
+    if failures:
+        raise FailedObservationsError([FailedObservation(active.ids[one.row], one.reason) for one in failures])
     # Unused results belong to previous maps; observation arrays are large and cheap to recompute.
     for path in sorted(work_folder.glob("*.record")):
         if path.name not in used:
             path.unlink()
-    return assemble_map(StationTable.cat(tables), config, frame) if tables else VectorMap.empty(frame)
+    return fused
 
 
 def make_blocks(
@@ -178,25 +192,23 @@ def _run_steps(
     results.
     """
 
-    def run_all(steps: Sequence[_BlockStep], name: str, fn: Callable[[_BlockStep], None], kind: type[T]) -> list[T]:
+    def run_all(steps: Sequence[_BlockStep], name: str, kind: type[T]) -> list[T]:
         report = None if progress is None else partial(progress, name)
-        map_blocks(fn, steps, runner, report)
+        failures = [failure for found in map_blocks(_run_step, steps, runner, report) for failure in found]
+        if failures:
+            raise FailedObservationsError(failures)
         used.update(step.path.name for step in steps)
-        return [_load_result(step, fn, kind) for step in steps]
+        return [_load_result(step, kind) for step in steps]
 
     if not blocks:
         return []
     homes = [b for b in blocks if b.home_ids]
     steps = [_BlockStep(b, None, -1) for b in homes]
-    state = merge_solutions(run_all(steps, "search", _run_pose_step, PoseSolution), config.pose_solver)
+    state = merge_solutions(run_all(steps, "search", PoseSolution), config.pose_solver)
     for number in range(config.pose_solver.num_steps):
         steps = [_BlockStep(b, _select_block(state, b), number) for b in homes]
-        state = merge_solutions(
-            run_all(steps, f"step {number + 1}", _run_pose_step, PoseSolution), config.pose_solver, number
-        )
-    return run_all(
-        [_BlockStep(b, _select_block(state, b), None) for b in blocks], "stations", _run_station_step, StationTable
-    )
+        state = merge_solutions(run_all(steps, f"step {number + 1}", PoseSolution), config.pose_solver, number)
+    return run_all([_BlockStep(b, _select_block(state, b), None) for b in blocks], "stations", StationTable)
 
 
 def _select_block(state: PoseSolution, block: TileBlock) -> PoseSolution:
@@ -204,38 +216,62 @@ def _select_block(state: PoseSolution, block: TileBlock) -> PoseSolution:
     return state.take(state.row_indices(block.observations.ids))
 
 
-def _load_result(step: _BlockStep, fn: Callable[[_BlockStep], None], kind: type[T]) -> T:
+def _load_result(step: _BlockStep, kind: type[T]) -> T:
     """Load the result of a step from the work folder; compute it here if the file is missing or damaged."""
     found = load_record(step.path, kind)
     if found is None:
         step.path.unlink(missing_ok=True)
-        fn(step)
+        if failures := _run_step(step):
+            raise FailedObservationsError(failures)
         found = load_record(step.path, kind)
     if found is None:
         raise StoreError(f"{step.path}: expected a step's result, but it cannot be written or read; check the disk.")
     return found
 
 
-def _run_pose_step(step: _BlockStep) -> None:
-    """Run the search or a sweep for a block's home, unless its result is stored."""
+def _run_step(step: _BlockStep) -> tuple[FailedObservation, ...]:
+    """Run a step and store its result, unless it is stored; return the observations of the block with which it fails."""
     if step.path.exists():
-        return
-    arrays = _load_arrays(step.block)
+        return ()
+    try:
+        result = _compute_step(step, _load_arrays(step.block))
+    except CONTENT_ERRORS:
+        result, failures = _isolate_step(step)
+        if failures:
+            return failures
+    save_record(step.path, result)
+    return ()
+
+
+def _compute_step(step: _BlockStep, arrays: ObservationArrays) -> PoseSolution | StationTable:
+    """Compute the search, a sweep of a block's home, or the block's stations."""
+    config = step.block.config
+    if step.solution is not None and step.number is None:
+        return build_stations(arrays, step.solution, step.block.area, config.stations)
     row = {name: k for k, name in enumerate(arrays.ids)}
     home = np.array([row[name] for name in step.block.home_ids], np.int64)
     if step.solution is None or step.number is None:
-        found = search_coarse_poses(arrays, home, step.block.config.pose_solver)
-    else:
-        found = run_step(arrays, step.solution, step.number, home, step.block.config.pose_solver)
-    save_record(step.path, found)
+        return search_coarse_poses(arrays, home, config.pose_solver)
+    return run_step(arrays, step.solution, step.number, home, config.pose_solver)
 
 
-def _run_station_step(step: _BlockStep) -> None:
-    """Build a block's stations, unless they are stored."""
-    if step.solution is None or step.path.exists():
-        return
-    table = build_stations(_load_arrays(step.block), step.solution, step.block.area, step.block.config.stations)
-    save_record(step.path, table)
+def _isolate_step(step: _BlockStep) -> tuple[PoseSolution | StationTable, tuple[FailedObservation, ...]]:
+    """Compute a step without the observations with which it fails; raises its error where leaving some out does not help."""
+    block, config = step.block, step.block.config
+    stored = read_active(block.log_folder, block.observations, np.arange(len(block.observations)))
+    home = set(block.home_ids)
+    # Home first: only with home observations does a step compute anything.
+    ordered = sorted(stored, key=lambda o: (o.id not in home, o.id))
+
+    def compute(rows: Sequence[int]) -> PoseSolution | StationTable:
+        chosen = [ordered[row] for row in rows]
+        arrays = to_observation_arrays(chosen, config.pose_solver.spacing_m)
+        part = replace(block, home_ids=tuple(o.id for o in chosen if o.id in home))
+        solution = None if step.solution is None else step.solution.take(step.solution.row_indices(sorted(arrays.ids)))
+        return _compute_step(replace(step, block=part, solution=solution), arrays)
+
+    result, failures = isolate_failures(compute, len(ordered))
+    return result, tuple(FailedObservation(ordered[one.row].id, one.reason) for one in failures)
 
 
 def _load_arrays(block: TileBlock) -> ObservationArrays:
