@@ -6,6 +6,7 @@ import pickle
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pytest
@@ -18,12 +19,15 @@ from manyeyes.maps.elements.observation_file import write_observations
 from manyeyes.maps.fusion import fuse as fusion
 from manyeyes.maps.isolation import isolate_failures
 from manyeyes.maps.store import tiled_fusion
+from manyeyes.maps.store.executors import ExecutorSession
 from manyeyes.maps.store.store import MapStore
 from manyeyes.studies.map_folder import read_vector_map
 
 pytest.importorskip("pyarrow", reason="the map extra is not installed")
 pytest.importorskip("shapely", reason="the map extra is not installed")
 
+B = TypeVar("B")
+R = TypeVar("R")
 FRAME = MapFrame(48.137, 11.575)
 
 
@@ -115,10 +119,10 @@ class RemoteExecutor:
     """A stand-in for a cluster: functions, blocks and results pass through pickle."""
 
     @contextmanager
-    def open(self) -> Iterator["RemoteExecutor"]:
+    def open(self) -> Iterator[ExecutorSession]:
         yield self
 
-    def run(self, fn: Callable, blocks: Sequence) -> Iterator[tuple[int, object]]:
+    def run(self, fn: Callable[[B], R], blocks: Sequence[B]) -> Iterator[tuple[int, R]]:
         for index, block in enumerate(blocks):
             remote_fn, remote_block = pickle.loads(pickle.dumps((fn, block)))
             yield index, pickle.loads(pickle.dumps(remote_fn(remote_block)))

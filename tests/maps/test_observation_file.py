@@ -188,6 +188,26 @@ def test_a_file_of_another_kind_version_or_frame_is_put_aside_whole(tmp_path: Pa
     assert aside.row == -1 and re.search(message, aside.reason)
 
 
+def test_a_first_file_about_another_origin_is_put_aside_and_not_all_others(tmp_path: Path) -> None:
+    many = crowd(5)
+    write_observations(tmp_path / "a.parquet", many[:3], MapFrame(10.0, 8.4))
+    write_observations(tmp_path / "b.parquet", many[3:4], FRAME)
+    write_observations(tmp_path / "c.parquet", many[4:], FRAME)
+    reading = read_observations(tmp_path)
+    assert reading.frame == FRAME and [o.id for o in reading.observations] == [o.id for o in many[3:]]
+    (aside,) = reading.rejected
+    assert aside.file.endswith("a.parquet") and re.search(
+        "origin: expected latitude 49.0.*most files; got 10.0", aside.reason
+    )
+
+
+def test_of_two_files_about_two_origins_that_of_more_rows_decides(tmp_path: Path) -> None:
+    many = crowd(5)
+    write_observations(tmp_path / "a.parquet", many[:1], MapFrame(10.0, 8.4))
+    write_observations(tmp_path / "b.parquet", many[1:], FRAME)
+    assert read_observations(tmp_path).frame == FRAME
+
+
 def test_files_without_our_metadata_or_columns_are_put_aside(tmp_path: Path) -> None:
     table = observation_table(crowd(2), FRAME)
     write_observations(tmp_path / "a.parquet", crowd(2), FRAME)

@@ -98,9 +98,10 @@ def report_rejected(rejected: Sequence[RejectedRows], console: Console) -> None:
 def write_vector_map(vector_map: VectorMap, folder: Path) -> None:
     """A map as a folder of two GeoParquet files: GeoArrow columns hold lines or polygons, not both.
 
-    They replace a former map without a moment at which lines of one map stand beside crossings of the other.
+    They replace a former map without a moment at which lines of one map stand beside crossings of the other; the caller holds the
+    folder's lock.
     """
-    from manyeyes._io import UNFINISHED, atomic_rename
+    from manyeyes._io import UNFINISHED, atomic_rename, remove_unfinished
     from manyeyes.maps.formats.geoparquet import write_map
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -112,8 +113,7 @@ def write_vector_map(vector_map: VectorMap, folder: Path) -> None:
         for draft, file in zip(drafts, files):
             atomic_rename(draft, file)
     finally:
-        for draft in drafts:
-            draft.unlink(missing_ok=True)
+        remove_unfinished(folder, below=False)
 
 
 def read_vector_map(folder: Path) -> VectorMap:

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import TaskID
 
+    from manyeyes.maps.elements.observation_file import LoadedObservations
     from manyeyes.maps.store.executors import Executor
     from manyeyes.maps.store.store import MapStore
 
@@ -40,14 +41,11 @@ class Options:
 
 def main(options: Options) -> None:
     """Fuse observations to a map, with a method or a store."""
-    import time
-
     from rich.console import Console
 
-    from manyeyes.maps.isolation import reject_failed
-    from manyeyes.maps.registry import MAP_FUSION_METHODS, fuse_isolated
-    from manyeyes.studies import provenance
-    from manyeyes.studies.map_folder import load_observations, report_rejected, write_vector_map
+    from manyeyes._lock import hold_folder
+    from manyeyes.maps.registry import MAP_FUSION_METHODS
+    from manyeyes.studies.map_folder import load_observations
 
     config = MAP_FUSION_METHODS.get(options.method).config_class()
     console = Console()
@@ -57,6 +55,21 @@ def main(options: Options) -> None:
     loaded = load_observations(options.observations, console)
     base = options.observations if options.observations.is_dir() else options.observations.parent
     out = options.out or base / ("map" if options.method == "manyeyes" else options.method)
+    with hold_folder(out):
+        _fuse_into_folder(options, loaded, config, out, console)
+
+
+def _fuse_into_folder(
+    options: Options, loaded: LoadedObservations, config: object, out: Path, console: Console
+) -> None:
+    """Fuse observations, without those that make the method fail, and write the map."""
+    import time
+
+    from manyeyes.maps.isolation import reject_failed
+    from manyeyes.maps.registry import fuse_isolated
+    from manyeyes.studies import provenance
+    from manyeyes.studies.map_folder import report_rejected, write_vector_map
+
     start = time.perf_counter()
     with console.status(f"Fusing {len(loaded.observations)} observations"):
         fused, failures = fuse_isolated(loaded.observations, options.method, config, loaded.frame)

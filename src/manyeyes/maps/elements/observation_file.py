@@ -35,6 +35,9 @@ _pyarrow = partial(import_extra, "pyarrow", "map", "Observations as Parquet")
 METADATA_KEY = b"manyeyes"
 CRS = "local transverse Mercator, WGS 84, scale 1"
 ROW_GROUP_SIZE = 1024
+# What a group of rows may hold once it is decoded; compressed, far more fits into a small file. A group of ROW_GROUP_SIZE
+# observations of 25 elements of 20 points has half a million values in its longest column.
+_MAX_GROUP_VALUES, _MAX_GROUP_BYTES = 20_000_000, 2**30
 # Origins closer than a tenth of a millimetre are one.
 _SAME_DEGREES = 1e-9
 _UPPER = np.triu_indices(3)
@@ -217,10 +220,13 @@ def _open(file: Path, expected: MapFrame | None) -> Any:
             f"{file}: origin: expected latitude {expected.latitude}, longitude {expected.longitude} as asked or as in most "
             f"files; got {frame.latitude}, {frame.longitude}. Reproject the poses."
         )
-    missing = [name for name in _REQUIRED if name not in opened.schema_arrow.names]
-    if missing:
+    names = opened.schema_arrow.names
+    missing = [name for name in _REQUIRED if name not in names]
+    twice = [wanted.name for wanted in _schema(pa) if names.count(wanted.name) > 1]
+    if missing or twice:
+        wrong = f"{', '.join(missing)} missing" if missing else f"{', '.join(twice)} more than once"
         raise ObservationError(
-            f"{file}: expected the columns of docs/maps/observation.md; {', '.join(missing)} missing."
+            f"{file}: expected the columns of docs/maps/observation.md; {wrong}. Write the file again."
         )
     return opened
 
@@ -237,11 +243,22 @@ def _iterate_file_rows(opened: Any) -> Iterator[tuple[int, Observation | tuple[i
     for group in range(opened.num_row_groups):
         count = opened.metadata.row_group(group).num_rows
         try:
+            _check_size(opened.metadata.row_group(group))
             for row, item in iterate_observations(opened.read_row_group(group)):
                 yield start + row, (1, item) if isinstance(item, str) else item
         except (pa.ArrowException, OSError, ObservationError) as error:
             yield start, (count, f"rows {start} to {start + count - 1} cannot be decoded: {_line(error)}")
         start += count
+
+
+def _check_size(group: Any) -> None:
+    """Raise ObservationError for a group of rows that takes too much memory when it is decoded."""
+    values = max((group.column(k).num_values for k in range(group.num_columns)), default=0)
+    if values > _MAX_GROUP_VALUES or group.total_byte_size > _MAX_GROUP_BYTES:
+        raise ObservationError(
+            f"expected at most {_MAX_GROUP_VALUES} values a column and {_MAX_GROUP_BYTES} bytes; got {values} and "
+            f"{group.total_byte_size}. Write smaller groups of rows."
+        )
 
 
 def _read_frame(file: Path, stored: dict[bytes, bytes]) -> MapFrame:
@@ -251,19 +268,21 @@ def _read_frame(file: Path, stored: dict[bytes, bytes]) -> MapFrame:
         kind, version, crs, origin = (metadata[key] for key in ("format", "version", "crs", "origin"))
         frame = MapFrame(float(origin["latitude"]), float(origin["longitude"]))
         geographic = origin["crs"]
-    except (KeyError, ValueError, TypeError) as error:
+    except (KeyError, ValueError, TypeError, OverflowError, RecursionError) as error:
         raise ObservationError(
             f"{file}: expected metadata 'manyeyes' with format, version, crs and origin as in docs/maps/observation.md; "
-            f"{type(error).__name__} {_line(error)}."
+            f"{type(error).__name__} {shorten(error)}."
         ) from error
     if kind != "observation" or not isinstance(version, int) or not 1 <= version <= FORMAT_VERSION:
         raise ObservationError(
-            f"{file}: expected format 'observation' of version 1 to {FORMAT_VERSION}; got {kind!r} of version {version!r}. "
+            f"{file}: expected format 'observation' of version 1 to {FORMAT_VERSION}; got {shorten(repr(kind))} of version "
+            f"{shorten(repr(version))}. "
             "Read a newer version with a newer manyeyes."
         )
     if crs != CRS or geographic != "EPSG:4326":
         raise ObservationError(
-            f"{file}: crs: expected '{CRS}' about an origin in EPSG:4326; got {crs!r} about {geographic!r}. Reproject the poses."
+            f"{file}: crs: expected '{CRS}' about an origin in EPSG:4326; got {shorten(repr(crs))} about "
+            f"{shorten(repr(geographic))}. Reproject the poses."
         )
     return frame
 
