@@ -157,7 +157,7 @@ def main(folder: Path, num_kills: int, num_limits: int, seed: int, verbs: Sequen
     for verb, write in ((verb, WRITERS[verb]) for verb in verbs):
 
         def inspect(at: Path, verb: str = verb, write: Callable[[Path], str] = write) -> str:
-            """What a reader finds, what one more run says, what a reader finds then, and unfinished files."""
+            """Return what a reader finds, the answer of one more run, what a reader finds then, and unfinished files."""
             found = state(at, verb), write(at), state(at, verb)
             return json.dumps([*found, [path.name for path in at.rglob("*unfinished*")]])
 
