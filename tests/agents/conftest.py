@@ -55,7 +55,7 @@ class Drive:
 
     def frame(self, agent: int, index: int) -> AgentFrame:
         """One agent's frame; its pose has zero covariance."""
-        starts = ((0.0, 0.0, 0.0, 0.0), (6.0, -3.0, 0.0, 0.7), (-9.0, 4.0, 0.2, -2.0))
+        starts = ((0.0, 0.0, 0.0, 0.0), (6.0, -3.0, 0.0, 0.7), (-9.0, 4.0, 0.2, -2.0), (3.0, 9.0, 0.0, 2.0))
         x, y, z, yaw = starts[agent]
         ahead = 0.1 * index * self.agent_mps
         pose = Transform.from_xyz_yaw(x + ahead * math.cos(yaw), y + ahead * math.sin(yaw), z, yaw)

@@ -261,8 +261,7 @@ class Agent:
                 untrusted = {correction.agent_id for correction in corrections if correction.untrusted}
                 messages = self.message_history.update_and_get(messages, frame.timestamp_ns, untrusted.union(excluded))
             boxes = self.strategy.fuse(self.perception_cache, frame, messages)
-            if messages:
-                boxes = restore_own_boxes(boxes, self.perception_cache.process(frame).boxes)
+            boxes = restore_own_boxes(boxes, self.perception_cache.process(frame).boxes)
             return _Attempt(Perception(_remove_own_body(boxes, frame), usable, corrections), self._state)
         finally:
             self._restore(before)
