@@ -187,10 +187,10 @@ class Agent:
         rejected, received = list(inbox.take_rejections()), list[ReceivedMessage]()
         for reception in inbox.received_messages(now_ns):
             if reception.message.agent_id != frame.agent_id:
-                checked, rejections = self._check(frame, reception, now_ns)
+                checked, rejections = self._check(frame, reception, now_ns, inbox.limits)
                 received += [] if checked is None else [checked]
                 rejected += rejections
-        selected, left_out = select_for_fusion(frame, received, self.message_history.senders, self.limits)
+        selected, left_out = select_for_fusion(frame, received, self.message_history.senders, inbox.limits)
         perception, failed = self._perceive(frame, selected)
         for rejection in failed:
             inbox.discard(rejection.agent_id)
@@ -202,10 +202,10 @@ class Agent:
         return replace(perception, rejected=(*rejected, *left_out, *failed))
 
     def _check(
-        self, frame: AgentFrame, reception: ReceivedMessage, now_ns: int
+        self, frame: AgentFrame, reception: ReceivedMessage, now_ns: int, limits: ReceiverLimits
     ) -> tuple[ReceivedMessage | None, list[Rejection]]:
         """Return a message with decoded tokens and a plausible or an unknown pose, or None; and what is rejected of it."""
-        message, limits = reception.message, self.limits
+        message = reception.message
         if self._quarantine.contains(message.agent_id, now_ns):
             return None, [Rejection(message.agent_id, "quarantined", "its content made fusion fail before")]
         if not -limits.max_skew_ns <= now_ns - message.timestamp_ns <= limits.max_age_ns:
