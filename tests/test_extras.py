@@ -56,9 +56,13 @@ def third_party() -> list[tuple[str, str, ast.Module]]:
 
 
 def named_extras(tree: ast.Module) -> set[str]:
-    """The extras that a file names in the error for a package that is not there."""
-    calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call) and getattr(n.func, "id", "") == "MissingExtraError"]
-    return {call.args[0].value for call in calls if isinstance(call.args[0], ast.Constant)}
+    """The extras that a file names where a package is not there: by MissingExtraError, or by import_extra at once or later."""
+    positions = {"MissingExtraError": 0, "import_extra": 1}
+    calls = [n for n in ast.walk(tree) if isinstance(n, ast.Call)]
+    named = [(getattr(call.func, "id", ""), call.args) for call in calls]
+    named += [(getattr(args[0], "id", ""), args[1:]) for name, args in named if name == "partial"]
+    values = [args[positions[name]] for name, args in named if name in positions]
+    return {str(value.value) for value in values if isinstance(value, ast.Constant)}
 
 
 @pytest.mark.slow

@@ -272,7 +272,7 @@ def test_view_replay_and_evaluate_open_a_log_of_one_agent_and_say_so(
     assert none["ap_summaries"] == early["ap_summaries"] and none["ap_summaries"][0]["n_gt"] == 3
 
 
-def test_without_pyarrow_the_extra_is_named(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pyarrow_a_recording_is_not_opened(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'manyeyes\[av2\]'"):
-        Argoverse2Recording(log.parent, gap=1).snapshot("abc", 0)
+        Argoverse2Recording(log.parent, gap=1)

@@ -24,12 +24,12 @@ from manyeyes.datatypes import (
     Boxes,
     ConfigError,
     GroundTruth,
-    MissingExtraError,
     PointCloud,
     RecordingError,
     Snapshot,
     Transform,
 )
+from manyeyes.datatypes.extras import import_extra
 
 _POSES = "city_SE3_egovehicle.feather"
 _AXLE_HEIGHT_M = 0.33
@@ -86,6 +86,7 @@ class Argoverse2Recording(RecordingReader):
         folder = self.root if split is None else self.root / split
         if not folder.is_dir():
             raise RecordingError(f"{folder}: no such folder, expected Argoverse 2 logs; check the path and the split.")
+        import_extra("pyarrow", "av2", "Reading Argoverse 2")
         self._folders: dict[str, Path] = {}
         self._sweeps: dict[str, tuple[int, ...]] = {}
         problems = []
@@ -237,10 +238,8 @@ def _rotation(quaternion: Tensor) -> Tensor:
 
 def _columns(path: Path, names: tuple[str, ...]) -> tuple[np.ndarray, ...]:
     """Read named columns of a feather file as arrays."""
-    try:
-        from pyarrow import ArrowException, feather
-    except ImportError:
-        raise MissingExtraError("av2", "Reading Argoverse 2") from None
+    from pyarrow import ArrowException, feather
+
     if not path.is_file():
         raise RecordingError(f"{path}: no such file, expected a feather table; download it.")
     try:
