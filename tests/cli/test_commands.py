@@ -78,7 +78,9 @@ def test_run_writes_table_pictures_animation_report_and_json(data, weights, tmp_
     assert all(n["ap_summaries"][0]["n_gt"] == 2 for n in held["result"]["stats"])
     with Image.open(tmp_path / "drive.gif") as film:
         assert film.n_frames == 2
-    assert (tmp_path / "report.html").read_text().count("data:image/") == 5
+    report = (tmp_path / "report.html").read_text()
+    assert report.count("data:image/") == 5
+    assert " --split test --scenario " in report
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from manyeyes.datatypes import Boxes, ConfigError, ShapeError
-from manyeyes.pose.landmarks import DetectorUncertainty, Landmarks
+from manyeyes.pose.landmarks import EGO_BODY_SIZE_M, EGO_BODY_UNCERTAINTY, DetectorUncertainty, Landmarks
 
 
 def marks(n=5, seed=0):
@@ -73,3 +73,17 @@ def test_descriptors_follow_their_landmarks():
     assert Landmarks.cat([described, one]).descriptor is None and one[:2].descriptor is None
     with pytest.raises(ShapeError, match=r"Landmarks\.descriptor"):
         replace(one, descriptor=descriptor[:2])
+
+
+def test_the_body_of_the_ego_is_the_last_landmark_at_the_origin():
+    """It has the size of a car, and an error of its own; the others stay as they are."""
+    before = marks(5)
+    after = before.with_ego_body()
+    assert len(after) == 6
+    for field in ("xy", "yaw", "size", "score", "sigma_xy", "sigma_yaw", "p_flip", "instant"):
+        np.testing.assert_array_equal(getattr(after, field)[:5], getattr(before, field))
+    assert after.xy[5].tolist() == [0.0, 0.0] and after.yaw[5] == 0.0 and after.score[5] == 1.0
+    assert tuple(after.size[5]) == EGO_BODY_SIZE_M
+    error = (after.sigma_xy[5], after.sigma_yaw[5], after.p_flip[5])
+    assert error == (EGO_BODY_UNCERTAINTY.sigma_xy_m, EGO_BODY_UNCERTAINTY.sigma_yaw_rad, EGO_BODY_UNCERTAINTY.p_flip)
+    assert len(Landmarks.empty().with_ego_body()) == 1

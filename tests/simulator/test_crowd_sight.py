@@ -13,6 +13,7 @@ from manyeyes.simulator.fleet.observation_model import (
     _clip_ring,
     _emit_ring,
     _hidden,
+    _max_range,
     _resample,
     build_map_index,
     hash_normal,
@@ -147,3 +148,9 @@ def test_recorded_drives_are_driven_where_a_place_has_them():
     assert np.abs(crowd.true_poses[:, 1] + 1.75).max() < 1.5
     assert np.abs(crowd.true_poses[:, 2]).max() < 0.1
     assert np.ptp(crowd.true_poses[:, 0]) > 60
+
+
+@pytest.mark.parametrize("limits", [(-10.0, 30.0, -5.0, 15.0), (-30.0, 10.0, -15.0, 5.0)])
+def test_the_range_of_an_asymmetric_view_is_that_of_its_far_corner(limits: tuple[float, ...]) -> None:
+    corner = np.array([max(limits[:2], key=abs), max(limits[2:], key=abs)])
+    assert _max_range(MapModelNoise(*limits, *([0.0] * 9))) == pytest.approx(np.hypot(*corner))

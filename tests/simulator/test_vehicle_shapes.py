@@ -58,3 +58,9 @@ def test_rotation_is_that_of_from_rpy() -> None:
 def test_an_unknown_kind_lists_the_known_ones() -> None:
     with pytest.raises(ConfigError, match="'tram'; choose one of car, van, truck, bus"):
         make_vehicle_shape("tram", (4, 2, 1), 0, 0)
+
+
+def test_no_vehicles_are_no_solids() -> None:
+    none = np.zeros(0)
+    solids = place_vehicle_shapes([], np.zeros((0, 3)), none, none, np.zeros(0, np.int64))
+    assert len(solids) == 0

@@ -204,3 +204,8 @@ def test_poses_are_evaluated_by_error_and_common_objects_and_stored(data, tmp_pa
     again = evaluate(data, tmp_path, "pose-estimation", "--correctors", "identity", "voting", "coalign")
     assert not calls and again["rows"] == held["rows"]
     assert not math.isnan(rows["voting", "gaussian", 0.8]["score"]["mean_displacement_m"])
+
+
+def test_every_number_of_common_objects_is_in_one_range() -> None:
+    for count in (*range(30), 10**6):
+        assert sum(low <= count <= high for low, high in pose.COMMON_OBJECT_RANGES) == 1, count

@@ -41,6 +41,14 @@ def test_fewer_rows_than_centres_are_all_kept():
     assert set(k_means(rows, 8, ("few",)).flatten().tolist()) == {1.0, 4.0, 9.0}
 
 
+@pytest.mark.parametrize("seed", range(10))
+def test_initial_centres_are_different_rows(seed):
+    """A row is drawn in proportion to its squared distance from the centres before it, hence a copy of one never."""
+    rows = torch.tensor([[0.0, 0.0], [0.0, 1.0], [50.0, 0.0], [-20.0, 7.0], [3.0, 3.0]])
+    found = k_means(rows.repeat(20, 1), 5, (seed,), iterations=0)
+    assert sorted(found.tolist()) == sorted(rows.tolist())
+
+
 def test_the_same_seed_gives_the_same_centres_and_each_stage_helps():
     x = torch.randn(600, 6, generator=torch.Generator().manual_seed(0))
     one, same, other = (fit_centres(x, CodebookConfig(2, 16), seed) for seed in (1, 1, 2))
