@@ -100,6 +100,7 @@ def _centimetres(metres: NDArray[np.floating[Any]], what: str) -> NDArray[np.int
     return codes.astype(np.int16)
 
 
+@lru_cache(maxsize=4)
 def _object_type(flags: int) -> np.dtype[Any]:
     """Return the row of an object, with what the flags of its body add."""
     velocity = [("velocity", "i1", 2)] if flags & _VELOCITY else []

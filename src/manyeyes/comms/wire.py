@@ -148,7 +148,7 @@ class EncodedBody(NamedTuple):
     content: bytes
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Fragment:
     """One packet, read and checked. body is None where the message has no section."""
 
