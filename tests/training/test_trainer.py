@@ -85,8 +85,12 @@ def test_a_finished_run_trains_no_more_and_lines_after_the_last_save_are_dropped
     before = load_file(weights)
     with (tmp_path / "log.jsonl").open("a") as log:
         log.write('{"step": 7, "loss": 0.0}\n{"step": 8, "lo')
-    Trainer(LineTask(CONFIG), tmp_path).run()
+    again = Trainer(LineTask(CONFIG), tmp_path)
+    again.run()
     assert steps_of(tmp_path) == [1, 2, 3, 4, 5, 6]
+    assert again.loss == pytest.approx(
+        json.loads((tmp_path / "log.jsonl").read_text().splitlines()[-1])["loss"], abs=1e-5
+    )
     assert all(torch.equal(value, before[name]) for name, value in load_file(weights).items())
 
 

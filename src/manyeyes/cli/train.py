@@ -131,7 +131,6 @@ def _train(options: Options, config: TrainConfig, out: Path, console: Console) -
     missing = check_files(recording, options.checks, console)
     if not console.quiet:
         remove_unfinished(out, below=False)
-    last: Progress | None = None
     with make_progress_bars(console) as bars:
         task = _make_task(options, config, recording, missing, bars)
         settings = {"options": options, "training": task.config}
@@ -140,8 +139,6 @@ def _train(options: Options, config: TrainConfig, out: Path, console: Console) -
         row = bars.add_task("Training", total=task.steps)
 
         def report(at: Progress) -> None:
-            nonlocal last
-            last = at
             shown = [f"{name} {at.terms[name]:.2f}" for name in task.shown_terms]
             bars.update(row, completed=at.step, description=", ".join((f"loss {at.loss:.3f}", *shown)))
 
@@ -149,8 +146,7 @@ def _train(options: Options, config: TrainConfig, out: Path, console: Console) -
     if console.quiet:
         return
     save_loss_curve(out / "log.jsonl", out / "loss.png")
-    measured = {"loss": last.loss, "seconds": last.seconds} if last else {"loss": None, "seconds": None}
-    result = {"weights": weights.name, **measured, "missing": missing}
+    result = {"weights": weights.name, "loss": trainer.loss, "seconds": trainer.seconds, "missing": missing}
     provenance.write_json(out / "train.json", result, settings, options.seed)
     if missing.count:
         console.print(missing_footer(missing.count, "train.json"), highlight=False, soft_wrap=True)

@@ -136,6 +136,7 @@ class Trainer(Generic[Model, Sample]):
         groups = parameter_groups(self.model, task.config.weight_decay)
         self.optimiser = torch.optim.AdamW(groups, betas=(0.9, task.config.beta2))
         self.step, self.seconds = 0, 0.0
+        self.loss: float | None = None  # of the last step
         begun = checkpoint.fingerprint(self.model).hex() if task.is_initialised else ""
         self._name = {"config": checkpoint.config_to_json(task.config), "seed": task.seed, "begun": begun}
         if self.path.exists():
@@ -193,6 +194,7 @@ class Trainer(Generic[Model, Sample]):
         rate = config.learning_rate * warmup_cosine(config.warmup_steps, self.step, self.task.steps)
         self._optimiser_step(rate)
         self.seconds += time.monotonic() - began
+        self.loss = total
         mean = {name: float(torch.stack([part[name] for part in parts]).sum()) for name in parts[0]}
         return Progress(self.step, self.task.steps, total, mean, rate, self.seconds)
 
@@ -203,7 +205,7 @@ class Trainer(Generic[Model, Sample]):
         parts = {name: getattr(self, name).state_dict() for name in ("model", "average", "optimiser")}
         # In memory first: torch reports a full disk as a RuntimeError without the file's name.
         content = io.BytesIO()
-        torch.save({**self._name, **parts, "step": self.step, "seconds": self.seconds}, content)
+        torch.save({**self._name, **parts, "step": self.step, "seconds": self.seconds, "loss": self.loss}, content)
         if self.log_path.exists():
             flush_files([self.log_path])  # a resumed run keeps the lines up to this state
         atomic_write(self.path, content.getbuffer())
@@ -273,7 +275,7 @@ class Trainer(Generic[Model, Sample]):
             )
         for name in ("model", "average", "optimiser"):
             getattr(self, name).load_state_dict(state[name])
-        self.step, self.seconds = state["step"], state["seconds"]
+        self.step, self.seconds, self.loss = state["step"], state["seconds"], state.get("loss")
 
 
 def parameter_groups(model: nn.Module, decay: float) -> list[dict[str, Any]]:
