@@ -21,6 +21,8 @@ from manyeyes import Agent, Boxes
 from manyeyes.agents.agent import Perception
 from manyeyes.agents.isolation import FIRST_QUARANTINE_NS
 from manyeyes.agents.own_detections import MIN_RESTORED_SCORE
+from manyeyes.agents.strategies import early
+from manyeyes.agents.strategies.message_header import make_header
 from manyeyes.agents.strategies.registry import FusionStrategy, get_strategy, list_strategies
 from manyeyes.comms import wire
 from manyeyes.comms.inbox import Inbox
@@ -308,3 +310,42 @@ def test_the_number_of_fused_senders_and_tokens_is_bounded(drive, detector, scen
     perception = ego.perceive(scene.frames[0], [packet for packets in many for packet in packets])
     assert len(counts[-1]) == 5 and sum(counts[-1]) <= 200 and min(counts[-1]) >= 30
     assert [r.reason for r in perception.rejected] == ["busy"] * 4
+
+
+def test_tokens_of_a_message_with_too_many_are_excluded(drive, detector, scene_of) -> None:
+    """The whole section: a message that names every cell left less than half of the honest boxes."""
+    scene = scene_of("intermediate", drive)
+    message = decoded(scene.packets[0][0])
+    count = len(message.tokens.sites)
+    for limit, rejected in ((count, []), (count - 1, [(1, "cells")])):
+        ego = Agent(detector, get_strategy("intermediate"))
+        ego.limits = replace(ego.limits, max_fused_message_tokens=limit)
+        perception = ego.perceive(scene.frames[0], scene.packets[0][0])
+        assert [(r.agent_id, r.reason) for r in perception.rejected] == rejected
+        assert (perception.received[0].message.tokens is None) is bool(rejected)
+
+
+def test_empty_messages_take_no_place_of_messages_with_content(drive, detector, scene_of) -> None:
+    scene, ego = scene_of("late", drive), Agent(detector, get_strategy("late"))
+    message = replace(decoded(scene.packets[0][0]), objects=None)
+    ego.limits = replace(ego.limits, max_fused_senders=3)
+    empty = [wire.encode(replace(message, agent_id=-k))[0] for k in range(5, 0, -1)]
+    perception = ego.perceive(scene.frames[0], [*empty, *(p for packets in scene.packets[0] for p in packets)])
+    assert [r.message.agent_id for r in perception.received] == [1, 2, 3]
+
+
+def test_a_cloud_much_larger_than_the_egos_is_thinned_out(drive, detector, monkeypatch) -> None:
+    monkeypatch.setattr(early, "MIN_POINT_LIMIT", 1000)
+    some, sizes = drive(1), []
+    ego = Agent(detector, get_strategy("early"))
+    frame = replace(some.frame(0, 2), points=some.frame(0, 2).points[:300])
+    message = replace(make_header(some.frame(1, 2), detector.fingerprint), points=PointCloud.of(torch.rand(5000, 3)))
+    run_detector = ego.perception_cache.run_detector
+
+    def count(cloud: PointCloud, before: PointCloud | None = None):
+        sizes.append(len(cloud))
+        return run_detector(cloud, before)
+
+    monkeypatch.setattr(ego.perception_cache, "run_detector", count)
+    ego.perceive(frame, wire.encode(message))
+    assert max(sizes) == 300 + 1000

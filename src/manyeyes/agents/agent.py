@@ -217,6 +217,10 @@ class Agent:
         except Exception as error:
             return None, [content_error(message.agent_id, error)]
         rejections = [] if rejection is None else [rejection]
+        if decoded.num_tokens > limits.max_fused_message_tokens:
+            text = f"{decoded.num_tokens} tokens; at most {limits.max_fused_message_tokens} are fused"
+            rejections.append(Rejection(message.agent_id, "cells", text))
+            decoded = replace(decoded, message=replace(decoded.message, tokens=None, token_score=None))
         if fault is None:
             return decoded, rejections
         rejections.append(Rejection(message.agent_id, "pose", fault))

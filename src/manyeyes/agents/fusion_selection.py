@@ -12,7 +12,7 @@ from manyeyes.agents.strategies.message_header import ego_from_sender
 from manyeyes.comms.bandwidth import allocate_max_min_fair
 from manyeyes.comms.inbox import ReceivedMessage, Rejection
 from manyeyes.comms.receiver_limits import ReceiverLimits
-from manyeyes.datatypes import AgentFrame, SparseBev
+from manyeyes.datatypes import AgentFrame, Message, SparseBev
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat
 
 
@@ -21,17 +21,19 @@ def select_for_fusion(
 ) -> tuple[list[ReceivedMessage], list[Rejection]]:
     """Return at most limits.max_fused_senders messages, with at most limits.max_fused_tokens tokens; and the senders left out.
 
-    Senders that were fused before come first, then the nearest. The tokens of one message that exceed its share are left out in
-    the order of their proposed confidence. known: senders that were fused before.
+    Messages with content come before empty ones, then senders that were fused before, then the nearest. The tokens of one message
+    that exceed its share are left out in the order of their proposed confidence. known: senders that were fused before.
     """
     if len(received) > limits.max_fused_senders:
-        order = sorted(received, key=lambda r: (r.message.agent_id not in known, _distance_m(frame, r)))
+        order = sorted(
+            received, key=lambda r: (_is_empty(r.message), r.message.agent_id not in known, _distance_m(frame, r))
+        )
         selected = {r.message.agent_id for r in order[: limits.max_fused_senders]}
     else:
         selected = {r.message.agent_id for r in received}
     kept = [r for r in received if r.message.agent_id in selected]
     left_out = [busy_rejection(r.message.agent_id, limits) for r in received if r.message.agent_id not in selected]
-    counts = [0 if r.message.tokens is None else len(r.message.tokens.sites) for r in kept]
+    counts = [r.num_tokens for r in kept]
     shares = allocate_max_min_fair(limits.max_fused_tokens, counts)
     return [_keep_tokens(r, share) if share < n else r for r, n, share in zip(kept, counts, shares)], left_out
 
@@ -39,6 +41,10 @@ def select_for_fusion(
 def busy_rejection(agent_id: int, limits: ReceiverLimits) -> Rejection:
     """Return the rejection of a sender beyond the number of senders that are fused."""
     return Rejection(agent_id, "busy", f"more than {limits.max_fused_senders} senders at one instant")
+
+
+def _is_empty(message: Message) -> bool:
+    return message.tokens is None and message.objects is None and message.points is None
 
 
 def _distance_m(frame: AgentFrame, reception: ReceivedMessage) -> float:

@@ -15,7 +15,7 @@ from manyeyes.comms.sender_table import SenderTable
 from manyeyes.comms.token_format import TokenFormat, TokenRefusal
 from manyeyes.datatypes import Message
 
-RejectionReason = TokenRefusal | Literal["content_error", "quarantined", "time", "pose", "busy"]
+RejectionReason = TokenRefusal | Literal["content_error", "quarantined", "time", "cells", "pose", "busy"]
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,8 @@ class Rejection:
 
     reason: as in DropCounts, or content_error: fusing it raised an error, which is the cause; quarantined: its content did so
     shortly before; time: captured too long before or after the receiver's time; pose: its pose is implausible and could not be
-    estimated; busy: beyond the number of senders that are fused at one instant. text: what was expected, what came.
+    estimated; cells: more tokens in one message than are fused; busy: beyond the number of senders that are fused at one instant.
+    text: what was expected, what came.
     """
 
     agent_id: int
@@ -59,6 +60,11 @@ class ReceivedMessage:
     def complete(self) -> bool:
         """Every packet of the message came and was of use."""
         return self.received_packets == self.expected_packets
+
+    @property
+    def num_tokens(self) -> int:
+        """Number of tokens of the message."""
+        return 0 if self.message.tokens is None else len(self.message.tokens.sites)
 
     def age_ns(self, now_ns: int) -> int:
         """Return the age of information: now less the time of capture."""

@@ -41,7 +41,8 @@ class ReceiverLimits:
     max_map_elements: int = 512
     # Distance of objects, map elements and the edges of a grid from their sender
     max_range_m: float = 300.0
-    # Fused at one instant: senders, and tokens of all of them together
+    # Fused: tokens of one message, beyond which all of them are excluded; senders, and tokens of all of them, at one instant
+    max_fused_message_tokens: int = 2_048
     max_fused_senders: int = 16
     max_fused_tokens: int = 8_192
     # Pose of a sender relative to the receiver; displacement between its messages by speed and a jump; stated sigma
