@@ -190,7 +190,7 @@ class Agent:
                 checked, rejections = self._check(frame, reception, now_ns, inbox.limits)
                 received += [] if checked is None else [checked]
                 rejected += rejections
-        selected, left_out = select_for_fusion(frame, received, self.message_history.senders, inbox.limits)
+        selected, left_out = select_for_fusion(frame, received, self._known_senders, inbox.limits)
         perception, failed = self._perceive(frame, selected)
         for rejection in failed:
             inbox.discard(rejection.agent_id)
@@ -230,16 +230,16 @@ class Agent:
 
     def _perceive(self, frame: AgentFrame, received: Sequence[ReceivedMessage]) -> tuple[Perception, list[Rejection]]:
         """Fuse the messages that can be fused together, and reject the others; the state is stored."""
-        known, now_ns = self.message_history.senders, frame.timestamp_ns
+        stored, known, now_ns = self.message_history.senders, self._known_senders, frame.timestamp_ns
         current = {reception.message.agent_id: reception for reception in received}
         failed: list[Rejection] = []
 
         def attempt(senders: Sequence[int]) -> _Attempt:
             usable = [reception for sender, reception in sorted(current.items()) if sender in senders]
-            return self._try_perceive(frame, usable, (known | current.keys()) - set(senders))
+            return self._try_perceive(frame, usable, (stored | current.keys()) - set(senders))
 
         # Senders that were fused before come first: of two that cannot be fused together, the newer one is excluded.
-        senders = sorted(known | current.keys(), key=lambda sender: (sender not in known, sender))
+        senders = sorted(stored | current.keys(), key=lambda sender: (sender not in known, sender))
         try:
             done = attempt(senders)
         except Exception as error:
@@ -269,6 +269,11 @@ class Agent:
             return _Attempt(Perception(_remove_own_body(boxes, frame), usable, corrections), self._state)
         finally:
             self._restore(before)
+
+    @property
+    def _known_senders(self) -> frozenset[int]:
+        """Senders that were fused recently, by strategies with and without history."""
+        return self.message_history.senders.union(self._accepted_poses)
 
     @property
     def _state(self) -> _State:
