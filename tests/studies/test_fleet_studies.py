@@ -260,3 +260,12 @@ def test_a_study_writes_its_tables_and_goes_on(experiment, tmp_path, monkeypatch
     monkeypatch.setattr(fleet_cells, "run_trial", lambda trial: pytest.fail("made again"))
     run(options, StudyContext("fusion", options, Console(quiet=True)))
     assert json.loads((tmp_path / "fusion.json").read_text())["result"] == held
+
+
+def test_an_unknown_method_is_refused_before_the_first_trial(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(fleet_cells, "run_trial", lambda trial: pytest.fail("a trial ran"))
+    options = FusionOptions(
+        places=("cross",), observation_counts=(12,), seeds=1, methods=(OURS, "guess"), workers=1, out=tmp_path
+    )
+    with pytest.raises(ConfigError, match="guess"):
+        run(options, StudyContext("fusion", options, Console(quiet=True)))
