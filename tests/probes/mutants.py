@@ -242,7 +242,7 @@ def main() -> int:
     parser = ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--seed", type=int, default=2026)
     parser.add_argument("--count", type=int, default=40)
-    parser.add_argument("--files", type=int, default=5, help="most test files of a module")
+    parser.add_argument("--files", type=int, default=8, help="most test files of a module")
     parser.add_argument("--timeout-s", type=float, default=300.0, help="of a test file on a mutant")
     parser.add_argument("--min-killed", type=float, default=0.95, help="fraction below which the exit status is 1")
     parser.add_argument("--only", type=int, nargs="+", help="numbers of drawn mutants; the others do not run")
