@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pool gives the list that a loop gives, and a block's exception reaches the caller; clusters: see test_tiles.py."""
 
+import contextlib
 import os
+import sys
 import time
 
 import pytest
@@ -64,6 +66,37 @@ def test_an_absent_engine_names_its_extra(monkeypatch):
     for name in ("dask", "ray"):
         with pytest.raises(MissingExtraError, match=rf"manyeyes\[{name}\]"):
             _run(make_executor(name), _fails_at_three, [1])
+
+
+class FakeRay:
+    """What the executor uses of ray, without a cluster."""
+
+    def __init__(self, initialized: bool) -> None:
+        self.initialized, self.calls = initialized, list[str]()
+
+    def is_initialized(self) -> bool:
+        return self.initialized
+
+    def init(self, **options: object) -> None:
+        self.calls.append(f"init at {options['address']} with {options.get('num_cpus')}")
+
+    def shutdown(self) -> None:
+        self.calls.append("shutdown")
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_ray_cluster_is_ended_by_whoever_began_it(monkeypatch, fails):
+    for initialized, address, wanted in (
+        (True, None, []),
+        (False, None, ["init at None with 3", "shutdown"]),
+        (False, "head:1", ["init at head:1 with None", "shutdown"]),
+    ):
+        fake = FakeRay(initialized)
+        monkeypatch.setitem(sys.modules, "ray", fake)
+        with contextlib.suppress(KeyError), make_executor("ray", 3, address).open():
+            if fails:
+                raise KeyError
+        assert fake.calls == wanted
 
 
 def test_an_unknown_executor_lists_the_known_ones():
