@@ -1,18 +1,86 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that are there whole or not at all, whatever ends the program that writes them, and whenever."""
+"""Files that are written whole or not at all, whatever ends the program that writes them; and inputs read within bounds.
+
+Inputs that are too large, or unpack to too much, are an OSError whose text names the bound.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import gzip
+import io
+import json
 import os
+import stat
+import zipfile
+import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO, Any
 
 UNFINISHED = ".unfinished"
 """Files with this in their names were being written when their writer ended; they are never read."""
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+MAX_FILE_BYTES = 1 << 30
+"""Maximum size of a file that is read as a whole, where a reader has no bound of its own."""
+MAX_TEXT_BYTES = 1 << 27
+"""Maximum size of a text that becomes a tree of objects (XML, yaml), unpacked: a tree takes about ten times as much."""
+
+
+def read_file(path: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
+    """Read a regular file of at most max_bytes.
+
+    Raises:
+        OSError: it cannot be read, is larger, or is a pipe or device, which may have no end.
+    """
+    status = path.stat()
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    if status.st_size > max_bytes:
+        raise _too_large(f"{status.st_size:,} bytes", max_bytes, path)
+    return path.read_bytes()
+
+
+def unpack_gzip(data: bytes, max_bytes: int, path: Path | str = "") -> bytes:
+    """Unpack gzip data to at most max_bytes; OSError where it is damaged or unpacks to more."""
+    try:
+        with gzip.open(io.BytesIO(data)) as file:
+            return _read_bounded(file, max_bytes, path)
+    except (EOFError, zlib.error) as error:
+        raise OSError(errno.EIO, f"damaged gzip data ({error})", str(path)) from error
+
+
+def unpack_zip_member(archive: zipfile.ZipFile, name: str, max_bytes: int, path: Path | str = "") -> bytes:
+    """Unpack one member of a zip file to at most max_bytes; OSError where it is damaged or unpacks to more."""
+    try:
+        with archive.open(name) as file:
+            return _read_bounded(file, max_bytes, path)
+    except (EOFError, zlib.error, RuntimeError, NotImplementedError) as error:
+        raise OSError(errno.EIO, f"damaged zip member {name} ({error})", str(path)) from error
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Parse JSON; ValueError where it is none, deeply nested JSON included."""
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def _read_bounded(file: gzip.GzipFile | IO[bytes], max_bytes: int, path: Path | str) -> bytes:
+    data = file.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise _too_large("it unpacks to more", max_bytes, path)
+    return data
+
+
+def _too_large(size: str, max_bytes: int, path: Path | str) -> OSError:
+    return OSError(errno.EFBIG, f"{size}; the maximum is {max_bytes:,} bytes", str(path))
 
 
 @contextmanager

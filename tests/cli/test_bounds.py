@@ -13,7 +13,16 @@ from manyeyes.cli.bounds import find_violation
 
 COMMANDS = [command for command in cli.COMMANDS if command not in cli.COMMAND_GROUPS]
 COMMANDS += [f"{group} {command}" for group, commands in cli.COMMAND_GROUPS.items() for command in commands]
-BAD = {"-1": -1.0, "0": 0.0, "2.5": 2.5, "nan": float("nan"), "inf": float("inf"), "1e400": float("inf"), "x": None}
+BAD = {
+    "-1": -1.0,
+    "0": 0.0,
+    "2.5": 2.5,
+    "nan": float("nan"),
+    "inf": float("inf"),
+    "1e400": float("inf"),
+    "x": None,
+    str(2**70): 2.0**70,
+}
 
 
 def numeric_options(options: type) -> dict[str, tuple[Any, type]]:
@@ -28,7 +37,7 @@ def numeric_options(options: type) -> dict[str, tuple[Any, type]]:
             if part in (int, float):
                 found.setdefault(name, (None, part))
             for item in getattr(part, "__metadata__", ()):
-                if isinstance(item, Bounds):
+                if isinstance(item, Bounds) and found.get(name, (None,))[0] is None:
                     found[name] = item, part.__origin__
     return found
 

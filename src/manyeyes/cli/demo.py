@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from manyeyes._bounds import Fraction, PositiveInt, Seed
+from manyeyes._bounds import Fraction, InputPath, OutputFolder, PositiveInt, Seed
 from manyeyes.datatypes import ConfigError
 from manyeyes.studies.replay_options import ReplayOptions, display_name, make_excerpt
 
@@ -29,11 +29,11 @@ PRESET = "demo"
 class Options:
     """Where the drive goes and how it is played."""
 
-    out: Path = Path("out/demo")
+    out: OutputFolder = Path("out/demo")
     """Folder for the recording, pictures, animation, report and JSON."""
     seed: Seed = 0
     """Another seed, another drive."""
-    towns: Path | None = None
+    towns: InputPath | None = None
     """A folder, a wheel of py123d or a CARLA installation with the towns' .xodr files; else the usual places."""
     frames: PositiveInt | None = None
     """At most so many evaluated frames, instead of all."""

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from manyeyes._bounds import NonNegativeFloat, NonNegativeInt
+from manyeyes._bounds import AngleDeg, LengthM, NonNegativeInt, OutputFolder
 from manyeyes.studies.options import EvaluationOptions
 from manyeyes.studies.replay_options import display_name, make_excerpt
 
@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 class Options(EvaluationOptions):
     """Which recording, which methods, by which protocol."""
 
-    out: Path = Path("out/evaluate")
+    out: OutputFolder = Path("out/evaluate")
     """Folder for results.json and results.md."""
-    noise_xy_m: NonNegativeFloat = 0.0
+    noise_xy_m: LengthM = 0.0
     """Standard deviation of the position noise of other agents."""
-    noise_yaw_deg: NonNegativeFloat = 0.0
+    noise_yaw_deg: AngleDeg = 0.0
     """Standard deviation of the heading noise of other agents, degrees."""
     all_egos: bool = False
     """Evaluate every agent as ego, not only the first."""

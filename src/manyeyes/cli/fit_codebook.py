@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from manyeyes._bounds import PositiveInt, Seed
+from manyeyes._bounds import OutputFile, PositiveInt, Seed, StageCount
 from manyeyes.studies.replay_options import FileChecks
 
 
@@ -16,13 +16,13 @@ class Options:
 
     data: Path
     """A data set, a folder of scenarios, or one scenario: OPV2V, DAIR-V2X, Argoverse 2, or the layout of a registered reader."""
-    out: Path
+    out: OutputFile
     """The file of the new weights; it may be the old one."""
     weights: Path
     """Weights that 'manyeyes train' wrote. They are kept as they are; a codebook that they have is replaced."""
     split: str | None = "train"
     """Which split of a dataset: a folder inside it."""
-    stages: PositiveInt = 4
+    stages: StageCount = 4
     """Bytes for the features of a token."""
     frame_stride: PositiveInt = 10
     """Use every n-th of the evaluated frames."""

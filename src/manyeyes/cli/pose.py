@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from manyeyes._bounds import Fraction, NonNegativeFloat, PositiveInt, Seed
+from manyeyes._bounds import AngleDeg, Fraction, LengthM, OutputFolder, PositiveInt, Seed
 from manyeyes.studies.replay_options import FileChecks, display_name, make_excerpt
 
 if TYPE_CHECKING:
@@ -53,9 +53,9 @@ class Options:
     correctors: tuple[str, ...] = ("identity", "voting")
     """Any of voting, identity, coalign, fpv-rcnn, feaco, icp, vips, v2x-reg-odist, v2x-reg-oiou, mash, feakm, or a .safetensors
     file of FeaKM; of whole clouds scan-registration and gicp."""
-    noise_xy_m: NonNegativeFloat = 0.0
+    noise_xy_m: LengthM = 0.0
     """Standard deviation of errors of collaborators' prior positions."""
-    noise_yaw_deg: NonNegativeFloat = 0.0
+    noise_yaw_deg: AngleDeg = 0.0
     """Standard deviation of errors of collaborators' prior headings, degrees."""
     no_prior: bool = False
     """Correctors get no prior pose."""
@@ -65,7 +65,7 @@ class Options:
     """Shipped weights by name, or a .safetensors file of 'manyeyes train'."""
     seed: Seed = 0
     """Of the noise."""
-    out: Path = Path("out/pose")
+    out: OutputFolder = Path("out/pose")
     """Folder for pose.json."""
     checks: FileChecks = field(default_factory=FileChecks)
     """What is done about missing files."""
@@ -110,6 +110,8 @@ def _evaluate_poses(options: Options) -> None:
     from manyeyes.viz.table import make_table, missing_footer
 
     console = Console()
+    if not options.correctors:
+        raise ConfigError("--correctors takes at least one name; got none.")
     for name in options.correctors:
         find_corrector(name)
     noise = PoseNoise("collaborators_iid", options.noise_xy_m, math.radians(options.noise_yaw_deg), options.seed)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from manyeyes._bounds import Fraction, NonNegativeInt, PositiveInt, Seed
+from manyeyes._bounds import Fraction, NonNegativeInt, OutputFolder, PositiveInt, Seed
 from manyeyes.studies.replay_options import FileChecks, ReplayOptions, display_name, make_excerpt
 
 
@@ -26,7 +26,7 @@ class Options:
     """At most so many evaluated frames."""
     frame: NonNegativeInt | None = None
     """Index of the instant that is pictured; the middle one by default."""
-    out: Path = Path("out/replay")
+    out: OutputFolder = Path("out/replay")
     """Folder for pictures, animation, report and JSON."""
     seed: Seed = 0
     """Of the channel's losses and jitter."""

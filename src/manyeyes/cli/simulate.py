@@ -7,7 +7,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from manyeyes._bounds import PositiveInt, Seed
+from manyeyes._bounds import InputPath, OutputFolder, Seed, WorkerCount
 
 
 @dataclass(frozen=True)
@@ -16,13 +16,13 @@ class Options:
 
     preset: str = "carla-towns-small"
     """Which set of scenarios; an unknown name lists the known ones."""
-    out: Path | None = None
+    out: OutputFolder | None = None
     """Folder for the splits and the manifest, data/PRESET or data/PRESET-cameras; a run that was stopped goes on there."""
     seed: Seed = 0
     """Another seed, other scenes."""
-    workers: PositiveInt = os.cpu_count() or 1
+    workers: WorkerCount = os.cpu_count() or 1
     """How many processes share the work."""
-    towns: Path | None = None
+    towns: InputPath | None = None
     """A folder, a wheel of py123d or a CARLA installation with the towns' .xodr files; else the usual places."""
     cameras: bool = False
     """Pictures too: four cameras a vehicle and one a pole, beside the clouds."""

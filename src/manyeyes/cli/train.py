@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from manyeyes._bounds import NonNegativeFloat, PositiveInt, Seed
+from manyeyes._bounds import BatchSize, LearningRate, OutputFolder, PositiveInt, Seed, WorkerCount
 from manyeyes.studies.replay_options import FileChecks
 
 if TYPE_CHECKING:
@@ -39,15 +39,15 @@ class Options:
     """Which split of a dataset: a folder inside it."""
     preset: str = "costr-small/stage1"
     """Settings by name; an unknown name lists the known ones."""
-    out: Path | None = None
+    out: OutputFolder | None = None
     """Folder of the run, runs/PRESET by default: weights.safetensors, log.jsonl, loss.png, train.json, last.pt to go on from."""
     seed: Seed = 0
     """Of weights, samples and augmentation."""
     steps: PositiveInt | None = None
     """Steps of the optimiser, instead of the preset's."""
-    batch: PositiveInt | None = None
+    batch: BatchSize | None = None
     """Samples a step over all processes, instead of the preset's."""
-    learning_rate: NonNegativeFloat | None = None
+    learning_rate: LearningRate | None = None
     """Instead of the preset's."""
     fusion: str | None = None
     """Fusion module of a detector by name, one of your own too, instead of the preset's; an unknown name lists the known ones."""
@@ -55,7 +55,7 @@ class Options:
     """Weights to begin from instead of random ones, such as those of the stage before. Of a map model several, each what it has in
     common with the preset, the first before the others. For feakm and feakm-paper the detector whose view they match, a shipped
     one by default."""
-    threads: PositiveInt = 1
+    threads: WorkerCount = 1
     """Threads of torch in each process; the result is the same only for the same number."""
     checks: FileChecks = field(default_factory=FileChecks)
     """What is done about missing files."""

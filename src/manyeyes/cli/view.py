@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from manyeyes._bounds import Fraction, NonNegativeInt, PositiveFloat, PositiveInt
+from manyeyes._bounds import ExtentM, Fraction, NonNegativeInt, OutputFile, PixelCount, PositiveInt
 from manyeyes.datatypes import ConfigError
 from manyeyes.studies.replay_options import ReplayOptions, make_excerpt
 
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from manyeyes.studies.replay_options import Excerpt
 
 SUFFIXES = (".png", ".gif", ".webp")
+MAX_PIXELS = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -37,11 +38,11 @@ class Options:
     """Index of the frame; the first evaluated one by default. An animation starts there."""
     frames: PositiveInt = 60
     """At most so many frames of an animation."""
-    out: Path = Path("out/view.png")
+    out: OutputFile = Path("out/view.png")
     """The file: .png for a frame, .gif or .webp for the drive."""
-    half_extent_m: tuple[PositiveFloat, PositiveFloat] = (70.4, 38.4)
+    half_extent_m: tuple[ExtentM, ExtentM] = (70.4, 38.4)
     """How far the picture reaches ahead and aside, metres; with --detect the detector's range counts."""
-    width: PositiveInt = 1280
+    width: PixelCount = 1280
     """Of the picture, pixels."""
     detect: str | None = None
     """Also draw what one method finds: none, late, intermediate or early."""
@@ -62,6 +63,12 @@ def main(options: Options) -> None:
 
     if options.out.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"--out ends in {', '.join(SUFFIXES)}; got {options.out.name}.")
+    height = options.width * options.half_extent_m[1] / options.half_extent_m[0]
+    if options.width * height > MAX_PIXELS:
+        raise ConfigError(
+            f"--width {options.width} and --half-extent-m {options.half_extent_m} make a picture of {options.width} x {height:.0f} "
+            f"pixels; at most {MAX_PIXELS:,} in all: choose a smaller one."
+        )
     recording = open_recording(options.recording, options.split)
     drive = make_excerpt(recording, options.scenario)
     single = options.out.suffix.lower() == ".png"

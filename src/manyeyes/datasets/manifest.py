@@ -9,13 +9,13 @@ that is being written is a folder with the suffix ``.partial``.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from manyeyes._io import parse_json, read_file
 from manyeyes.datasets.missing import FileProblem
 from manyeyes.datatypes import RecordingError
 
@@ -45,7 +45,7 @@ class Digests:
     def read(cls, path: Path) -> Digests | None:
         """Read scenario.json or a file of a batch; None where the file has no digests of the simulator."""
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = parse_json(read_file(path))
             entry, by_path = content["entry"], content.get("files")
             if by_path is not None:
                 by_path = {str(name): str(digest) for name, digest in by_path.items()}
@@ -136,7 +136,7 @@ def read_manifest(root: Path) -> dict[str, Any] | None:
     if path is None:
         return None
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(read_file(path))
         assert isinstance(content["format"], str) and isinstance(content["settings"], dict)
         assert all(isinstance(entry["split"], str) and isinstance(entry["name"], str) for entry in content["scenarios"])
     except (OSError, ValueError, KeyError, TypeError, AssertionError):

@@ -1,6 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exceptions of manyeyes; each text gives the expected value, the actual value, and a remedy."""
 
+import reprlib
+
+_REPR = reprlib.Repr()
+_REPR.maxstring = _REPR.maxother = _REPR.maxlong = 60
+
+
+def shorten(value: object) -> str:
+    """Write a value of a file for the text of an error: at most 80 characters, also where aliases nest it."""
+    text = " ".join(_REPR.repr(value).split())
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
 
 class ManyeyesError(Exception):
     """Base of all designed errors: the command line prints its one line and exits with 1."""

@@ -10,6 +10,9 @@ from torch import Tensor
 
 from manyeyes.datatypes.errors import ConfigError
 
+MAX_SIDE_CELLS = 2**16
+"""Maximum number of pillars along a side of a grid."""
+
 
 @dataclass(frozen=True)
 class BevGrid:
@@ -32,6 +35,11 @@ class BevGrid:
     def __post_init__(self) -> None:
         if not (self.x_max > self.x_min and self.y_max > self.y_min and self.z_max > self.z_min and self.pillar > 0):
             raise ConfigError(f"BevGrid needs max > min on every axis and pillar > 0; got {self}.")
+        rows, columns = (self.y_max - self.y_min) / self.pillar, (self.x_max - self.x_min) / self.pillar
+        if not max(rows, columns) <= MAX_SIDE_CELLS:
+            raise ConfigError(
+                f"BevGrid has at most {MAX_SIDE_CELLS:,} pillars a side; got {self}: take a larger pillar."
+            )
         if self.stride not in (1, 2, 4, 8, 16, 32):
             raise ConfigError(f"BevGrid.stride is one of 1, 2, 4, 8, 16, 32; got {self.stride}.")
 

@@ -6,6 +6,8 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
+import types
 import typing
 from collections.abc import Callable
 from pathlib import Path
@@ -16,12 +18,18 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialize
 from torch import nn
 
-from manyeyes._io import atomic_write
-from manyeyes.datatypes import CheckpointError, ConfigError
+from manyeyes._bounds import Bounds
+from manyeyes._io import atomic_write, parse_json
+from manyeyes.datatypes import BevGrid, CheckpointError, ConfigError
+from manyeyes.datatypes.errors import shorten
 from manyeyes.models.detector.detector import Detector, DetectorConfig
 
 FORMAT = "manyeyes-detector-1"
 """Format name in the metadata of a detector's file; models of other types have their own."""
+
+_MAX_INT, _MAX_ITEMS, _MAX_CELLS = 2**20, 64, 2**24
+_BUILD_ERRORS = (ArithmeticError, AssertionError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
+"""What a constructor of a model raises on numbers that do not fit each other."""
 
 Config = TypeVar("Config")
 Model = TypeVar("Model", bound=nn.Module)
@@ -33,17 +41,19 @@ def config_to_json(config: Any) -> str:
 
 
 def config_from_json(kind: type, text: str) -> Any:
-    """Invert config_to_json; unknown fields, and missing fields without a default, are errors."""
-    return _build(kind, json.loads(text))
+    """Invert config_to_json.
+
+    Raises:
+        ConfigError: unknown fields, missing fields without a default, or values of another type or outside their bounds.
+    """
+    return _build(kind, parse_json(text), "configuration")
 
 
-def _build(kind: Any, value: Any) -> Any:
-    if value is None:
-        return None
-    kind = _alternative(kind, value)
+def _build(hint: Any, value: Any, name: str) -> Any:
+    kind = None if value is None else _alternative(hint, value)
     if not dataclasses.is_dataclass(kind):
-        return tuple(value) if isinstance(value, list) else value
-    hints = typing.get_type_hints(kind)
+        return _check_value(hint, value, name)
+    hints = typing.get_type_hints(kind, include_extras=True)
     known = {f.name for f in dataclasses.fields(kind)}
     needed = {f.name for f in dataclasses.fields(kind) if f.default is f.default_factory is dataclasses.MISSING}
     if not isinstance(value, dict) or not needed <= set(value) <= known:
@@ -51,12 +61,57 @@ def _build(kind: Any, value: Any) -> Any:
             f"{getattr(kind, '__name__', kind)} has fields {sorted(known)}; the stored configuration has "
             f"{sorted(value) if isinstance(value, dict) else value!r}."
         )
-    return kind(**{name: _build(hints[name], item) for name, item in value.items()})  # pyright: ignore[reportCallIssue]
+    built = kind(**{key: _build(hints[key], item, f"{name}.{key}") for key, item in value.items()})  # pyright: ignore[reportCallIssue]
+    if isinstance(built, BevGrid) and math.prod(built.shape) > _MAX_CELLS:
+        rows, columns = built.shape
+        raise ConfigError(f"{name} has {rows} x {columns} cells; the maximum is {_MAX_CELLS:,}, by a larger pillar.")
+    return built
+
+
+def _check_value(hint: Any, value: Any, name: str) -> Any:
+    """Return a value as the type of its field has it: a number within its bounds, a text, or a tuple of such values."""
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Annotated:
+        value = _check_value(parts[0], value, name)
+        for bounds in parts[1:]:
+            if isinstance(bounds, Bounds) and not bounds.contains(value):
+                raise ConfigError(f"{name} needs {bounds.text}; got {value}.")
+        return value
+    if origin in (typing.Union, types.UnionType):
+        options = [part for part in parts if part is not type(None)]
+        return None if value is None and len(options) < len(parts) else _check_value(options[0], value, name)
+    if origin is tuple:
+        return _check_tuple(parts, value, name)
+    if origin is typing.Literal:
+        if value not in parts:
+            raise ConfigError(f"{name} is one of {', '.join(map(str, parts))}; got {shorten(value)}.")
+        return value
+    return _check_scalar(hint, value, name)
+
+
+def _check_tuple(hints: tuple[Any, ...], value: Any, name: str) -> tuple[Any, ...]:
+    is_open = hints[-1] is Ellipsis
+    if not isinstance(value, list) or len(value) > _MAX_ITEMS or not (is_open or len(value) == len(hints)):
+        count = f"at most {_MAX_ITEMS}" if is_open else len(hints)
+        raise ConfigError(f"{name} needs a list of {count} values; got {shorten(value)}.")
+    item_hints = hints[:1] * len(value) if is_open else hints
+    return tuple(_check_value(hint, item, f"{name}[{k}]") for k, (hint, item) in enumerate(zip(item_hints, value)))
+
+
+def _check_scalar(kind: Any, value: Any, name: str) -> Any:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if kind is int and not (is_number and isinstance(value, int) and 0 <= value <= _MAX_INT):
+        raise ConfigError(f"{name} needs an integer from 0 to {_MAX_INT}; got {shorten(value)}.")
+    if kind is float and not (is_number and not math.isnan(value)):
+        raise ConfigError(f"{name} needs a number; got {shorten(value)}.")
+    if kind in (bool, str) and not isinstance(value, kind):
+        raise ConfigError(f"{name} needs a {kind.__name__}; got {shorten(value)}.")
+    return value
 
 
 def _alternative(kind: Any, value: Any) -> Any:
     """Select from a union of dataclasses the one whose field names equal the keys of value, else the first."""
-    kinds = [k for k in typing.get_args(kind) if dataclasses.is_dataclass(k)]
+    kinds = [k for k in typing.get_args(kind) if isinstance(k, type) and dataclasses.is_dataclass(k)]
     named = set(value) if isinstance(value, dict) else set()
     return next((k for k in kinds if named == {f.name for f in dataclasses.fields(k)}), kinds[0] if kinds else kind)
 
@@ -95,15 +150,25 @@ def load_as(path: Path, format: str, kind: type[Config], build: Callable[[Config
     """Load a model in evaluation mode; build makes it from the configuration stored in its file."""
     state, metadata = _read(path, format)
     try:
-        model = build(config_from_json(kind, metadata["config"]))
+        config = config_from_json(kind, metadata["config"])
+        with torch.device("meta"):  # shapes alone: memory is taken only for what the file holds
+            _check_tensors(path, state, _tensors(build(config)))
+        model = build(config)
     except json.JSONDecodeError as error:
         raise CheckpointError(f"{path}: its configuration is not JSON ({error}); copy or train it again.") from error
-    except (ConfigError, TypeError) as error:
+    except (ConfigError, *_BUILD_ERRORS) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
         raise CheckpointError(
-            f"{path}: its configuration is not one of this version of manyeyes: {error} "
+            f"{path}: its configuration is not one of this version of manyeyes: {reason[:600]} "
             "Use the version that wrote it, install the package that registers what is missing, or train again."
         ) from error
-    expected = _tensors(model)
+    model.load_state_dict({k: v.float() for k, v in state.items()}, strict=False)
+    model.eval().requires_grad_(False)
+    return model
+
+
+def _check_tensors(path: Path, state: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) -> None:
+    """Compare names, shapes and values of a file's tensors with those of a model, which may be without memory."""
     for name in sorted(set(expected) | set(state)):
         if name not in state or name not in expected or state[name].shape != expected[name].shape:
             here = tuple(state[name].shape) if name in state else "nothing"
@@ -114,9 +179,6 @@ def load_as(path: Path, format: str, kind: type[Config], build: Callable[[Config
             )
         if not bool(torch.isfinite(state[name]).all()):
             raise CheckpointError(f"{path}: tensor {name} has NaN or infinite values; train again from an older save.")
-    model.load_state_dict({k: v.float() for k, v in state.items()}, strict=False)
-    model.eval().requires_grad_(False)
-    return model
 
 
 def read_state(path: Path, format: str = FORMAT) -> dict[str, torch.Tensor]:
@@ -126,7 +188,13 @@ def read_state(path: Path, format: str = FORMAT) -> dict[str, torch.Tensor]:
 
 def read_card(path: Path, format: str = FORMAT) -> dict[str, Any]:
     """Read the model card of a weights file."""
-    return json.loads(_read(path, format)[1]["card"])
+    try:
+        card = parse_json(_read(path, format)[1]["card"])
+    except (KeyError, ValueError):
+        card = None
+    if not isinstance(card, dict):
+        raise CheckpointError(f"{path}: no model card in its metadata; copy or train it again.")
+    return card
 
 
 def _read(path: Path, format: str = FORMAT) -> tuple[dict[str, torch.Tensor], dict[str, str]]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from manyeyes._io import parse_json, read_file
 from manyeyes.datatypes import ConfigError
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ class MapFolder:
         if not file.is_file():
             return None
         try:
-            content = json.loads(file.read_text(encoding="utf-8"))
+            content = parse_json(read_file(file))
             x0, y0, x1, y1 = (float(v) for v in content["area"])
             return CutPolicy(shapely.from_wkt(content["junctions"]), (x0, y0, x1, y1))
         except (ValueError, KeyError, TypeError, shapely.errors.ShapelyError) as error:

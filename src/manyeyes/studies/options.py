@@ -7,7 +7,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from manyeyes._bounds import PositiveInt, Seed
+from manyeyes._bounds import ByteCount, OutputFolder, PositiveInt, Seed, TrialCount, WorkerCount
 from manyeyes.studies.replay_options import FileChecks, ReplayOptions
 
 
@@ -15,7 +15,7 @@ from manyeyes.studies.replay_options import FileChecks, ReplayOptions
 class StudyOptions:
     """Options of every study."""
 
-    out: Path = Path("out/study")
+    out: OutputFolder = Path("out/study")
     """Folder for the results as .json, .md and .png; finished cells are kept there, and a stopped study goes on."""
 
 
@@ -42,7 +42,7 @@ class EvaluationOptions(RecordingStudyOptions):
     protocol: str = "global-sort"
     """Evaluation protocol: global-sort, opencood, coalign, sparsealign; on DAIR-V2X also dair, heal-dair, costr-dair,
     sparsealign-dair."""
-    workers: PositiveInt = os.cpu_count() or 1
+    workers: WorkerCount = os.cpu_count() or 1
     """How many processes share the scenarios; results do not depend on it."""
     replay_options: ReplayOptions = field(default_factory=ReplayOptions)
     """How agents collaborate."""
@@ -62,7 +62,7 @@ class RobustnessOptions(EvaluationOptions):
 class SharedBandwidthOptions(EvaluationOptions):
     """Options of the study shared-bandwidth."""
 
-    budgets: tuple[PositiveInt, ...] = ()
+    budgets: tuple[ByteCount, ...] = ()
     """Budgets in bytes, of one message (bandwidth) or of all messages of a snapshot (shared-bandwidth); by default the study's."""
     token_selection: tuple[str, ...] = ()
     """Methods that select tokens; by default intermediate, intermediate-confidence, intermediate-random."""
@@ -118,9 +118,9 @@ class FeakmOptions(RecordingStudyOptions):
 class FleetStudyOptions(StudyOptions):
     """Options of studies of simulated fleets."""
 
-    seeds: PositiveInt = 3
+    seeds: TrialCount = 3
     """Number of seeds."""
-    workers: PositiveInt = 2
+    workers: WorkerCount = 2
     """Processes that share the trials; results do not depend on it."""
 
 
@@ -146,7 +146,7 @@ class FleetPoseNoiseOptions(MapFusionStudyOptions):
 class FusionOptions(FleetPoseNoiseOptions):
     """Options of the study fusion."""
 
-    observation_counts: tuple[PositiveInt, ...] = ()
+    observation_counts: tuple[TrialCount, ...] = ()
     """Counts of observations; by default 20, 60, 200."""
 
 
@@ -164,7 +164,7 @@ class TuningOptions(StudyOptions):
 
     methods: tuple[str, ...] = ()
     """Map fusion methods; by default all."""
-    workers: PositiveInt = 2
+    workers: WorkerCount = 2
     """Processes that share the trials; results do not depend on it."""
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from manyeyes._bounds import NonNegativeFloat, PositiveInt
+from manyeyes._bounds import ByteCount, DurationMs
 from manyeyes.datatypes import ConfigError
 
 if TYPE_CHECKING:
@@ -30,9 +30,9 @@ class ReplayOptions:
     """What is compared: strategies by name, those of your own too; an unknown name lists the known ones."""
     channel: str = "ideal"
     """The channel between agents: ideal, its-g5, its-g5-27mbps, lte-v2x, nr-sidelink, cellular."""
-    latency_budget_ms: NonNegativeFloat | None = None
+    latency_budget_ms: DurationMs | None = None
     """How long an ego waits for messages after its own sweep; by default 0 on the ideal channel, else one period, 100."""
-    budget_bytes: PositiveInt = 1 << 17
+    budget_bytes: ByteCount = 1 << 17
     """The most that a message of tokens may weigh."""
     token_encoding: Literal["float32", "float16", "int8", "codebook"] | None = None
     """How tokens are written: their features as numbers, or all of them as the codes of the weights' codebook; by default as

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from manyeyes._bounds import NonNegativeFloat, PositiveInt, Seed
+from manyeyes._bounds import LengthM, OutputFolder, PositiveInt, Seed
 from manyeyes.datatypes import ConfigError
 from manyeyes.studies.replay_options import FileChecks
 
@@ -45,14 +45,14 @@ class Options:
     """Use every n-th frame."""
     channel: str = "ideal"
     """The channel between agents: ideal, its-g5, its-g5-27mbps, lte-v2x, nr-sidelink, cellular."""
-    pose_sigma: NonNegativeFloat = 0.0
+    pose_sigma: LengthM = 0.0
     """Standard deviation of errors added to prior positions, metres; headings err in proportion, 1 degree a metre."""
     map: Path | None = None
     """The true map of a recording that no town is named after, in its world: an intersection of V2X-Seq (.json), a map of Argoverse
     2 (log_map_archive_*.json), or Lanelet2's .osm; without it such a map is made, not evaluated."""
     seed: Seed = 0
     """Of errors and losses."""
-    out: Path = Path("out/map-build")
+    out: OutputFolder = Path("out/map-build")
     """Folder for the maps, one a town: observations, truth, map, page, picture; and build.json."""
     checks: FileChecks = field(default_factory=FileChecks)
     """What is done about missing files."""

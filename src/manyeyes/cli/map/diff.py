@@ -8,6 +8,8 @@ from pathlib import Path
 
 import tyro
 
+from manyeyes._bounds import OutputFile
+
 
 @dataclass(frozen=True)
 class Options:
@@ -17,7 +19,7 @@ class Options:
     """The earlier map's folder, of 'map fuse'."""
     new: tyro.conf.Positional[Path]
     """The later map's folder."""
-    out: Path | None = None
+    out: OutputFile | None = None
     """Also write this: .json with all numbers, or .html, a page that shows what is new and what is gone."""
 
 

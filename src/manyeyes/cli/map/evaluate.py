@@ -8,6 +8,7 @@ from pathlib import Path
 
 import tyro
 
+from manyeyes._bounds import InputPath
 from manyeyes.datatypes import ConfigError
 
 
@@ -17,7 +18,7 @@ class Options:
 
     folder: tyro.conf.Positional[Path]
     """The map's folder, of 'map fuse'."""
-    truth: Path | None = None
+    truth: InputPath | None = None
     """A map's folder with the truth; 'truth' beside the map is found by itself."""
 
 
@@ -32,10 +33,11 @@ def main(options: Options) -> None:
     from manyeyes.viz.map_table import PROTOCOLS, make_kinds_table
 
     console, path = Console(), options.folder
+    vector_map = read_vector_map(path).select_published().elements
     truth_folder = options.truth or path.parent / "truth"
     if not truth_folder.is_dir():
         raise ConfigError(f"{truth_folder}: no truth there; name one with --truth.")
-    vector_map, truth = read_vector_map(path).select_published().elements, read_vector_map(truth_folder).elements
+    truth = read_vector_map(truth_folder).elements
     cut_policy = MapFolder(truth_folder.parent).read_cut_policy()
     evaluated = cut_policy(vector_map) if cut_policy else vector_map
     metrics = evaluate_map(evaluated, truth)

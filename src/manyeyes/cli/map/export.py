@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from manyeyes._bounds import NonNegativeFloat
+from manyeyes._bounds import LengthM, OutputFile
 
 
 @dataclass(frozen=True)
@@ -17,11 +17,11 @@ class Options:
 
     folder: tyro.conf.Positional[Path]
     """The map's folder, of 'map fuse'."""
-    file: tyro.conf.Positional[Path]
+    file: tyro.conf.Positional[OutputFile]
     """The file; .geojson, .gpkg, .parquet, .osm, .pmtiles and .npz name their format, .json needs --format."""
     format: str | None = None
     """geojson, geopackage, geoparquet, lanelet2, argoverse2, nuscenes, pmtiles or graph, where the ending does not say it."""
-    simplify_m: NonNegativeFloat = 0.05
+    simplify_m: LengthM = 0.05
     """Lines may leave their stations by so much, metres; 0 writes every station."""
     include_unpublished: bool = False
     """Also what is not published: candidates, deprecated and retired elements."""

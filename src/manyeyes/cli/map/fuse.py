@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from manyeyes._bounds import PositiveInt
+from manyeyes._bounds import OutputFolder, WorkerCount
 from manyeyes.datatypes import ConfigError
 
 if TYPE_CHECKING:
@@ -27,15 +27,15 @@ class Options:
 
     observations: tyro.conf.Positional[Path]
     """A Parquet file of observations, a folder of them, or a folder of 'map simulate'; see docs/maps/observation.md."""
-    out: Path | None = None
+    out: OutputFolder | None = None
     """Folder for the map, two GeoParquet files; 'map' beside the observations by default."""
     method: str = "manyeyes"
     """A registered method: manyeyes, or a baseline such as union, chamfer-nms, polymerge; an unknown name lists all."""
-    store: Path | None = None
+    store: OutputFolder | None = None
     """Instead of a map's folder: a store, made if it is not there, which takes the observations in and publishes a release."""
     executor: str = "process"
     """What fuses a store's tiles: inline, process, dask or ray."""
-    workers: PositiveInt | None = None
+    workers: WorkerCount | None = None
     """How many processes; one a core by default. The map does not depend on it."""
 
 

@@ -9,7 +9,7 @@ from typing import Literal
 
 import tyro
 
-from manyeyes._bounds import FiniteFloat, Fraction
+from manyeyes._bounds import Fraction, LatitudeDeg, LongitudeDeg, OffsetM, OutputFolder
 from manyeyes.datatypes import ConfigError
 
 
@@ -21,7 +21,7 @@ class Options:
     """nuscmap_results.json of MapTR, or submission_vector.json of StreamMapNet; recognised by their layout."""
     poses: Path | None = None
     """A CSV with token, agent, pass_id, time_ns, x, y, yaw and, if known, sigma_x, sigma_y, sigma_yaw."""
-    origin: tuple[FiniteFloat, FiniteFloat] | None = None
+    origin: tuple[LatitudeDeg, LongitudeDeg] | None = None
     """Latitude and longitude, degrees, of the point that is x = y = 0 of the CSV's poses."""
     nuscenes: Path | None = None
     """Instead of a CSV: the folder of nuScenes' tables (with sample_data.json)."""
@@ -29,15 +29,15 @@ class Options:
     """Which of nuScenes' locations; a map has one frame."""
     axes: Literal["vehicle", "lidar"] = "vehicle"
     """Of the points: vehicle (x forward, y left) or lidar (x right, y forward: MapTR on nuScenes)."""
-    range_x: tuple[FiniteFloat, FiniteFloat] = (-30.0, 30.0)
+    range_x: tuple[OffsetM, OffsetM] = (-30.0, 30.0)
     """The model's view ahead of the vehicle, metres."""
-    range_y: tuple[FiniteFloat, FiniteFloat] = (-15.0, 15.0)
+    range_y: tuple[OffsetM, OffsetM] = (-15.0, 15.0)
     """The model's view to the left of the vehicle, metres."""
     min_score: Fraction = 0.1
     """Elements below this score are left out."""
     model: str = "imported"
     """What the observations say made them."""
-    out: Path = Path("out/map/imported")
+    out: OutputFolder = Path("out/map/imported")
     """Folder for the observations; 'map fuse' takes it."""
 
 

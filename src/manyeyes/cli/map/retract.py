@@ -11,7 +11,7 @@ from pathlib import Path
 
 import tyro
 
-from manyeyes._bounds import PositiveInt
+from manyeyes._bounds import WorkerCount
 from manyeyes.datatypes import ConfigError
 
 
@@ -33,7 +33,7 @@ class Options:
     """Fuse and publish a release at once; else the next fusion leaves them out."""
     executor: str = "process"
     """What fuses the tiles: inline, process, dask or ray."""
-    workers: PositiveInt | None = None
+    workers: WorkerCount | None = None
     """How many processes; one a core by default. The map does not depend on it."""
 
 

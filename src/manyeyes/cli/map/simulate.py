@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from manyeyes._bounds import NonNegativeFloat, PositiveFloat, PositiveInt, Seed
+from manyeyes._bounds import ExtentM, LengthM, OutputFolder, Seed, TrialCount
 
 
 @dataclass(frozen=True)
@@ -17,18 +17,18 @@ class Options:
 
     place: tyro.conf.Positional[str] = "cross"
     """A CARLA town, av2-miami, av2-pittsburgh, lanelet2, cross, grid, or grid-N with N crossroads a side."""
-    observations: PositiveInt = 60
+    observations: TrialCount = 60
     """How many; the first of a larger crowd are those of a smaller one."""
     crowd: str = "local"
     """Observation noise and fleet: local, semi-global, perfect, independent-malicious, colluding-malicious, outdated,
     with-infrastructure."""
-    pose_sigma: NonNegativeFloat | None = None
+    pose_sigma: LengthM | None = None
     """Another standard deviation of prior positions, metres; headings err in proportion, 1 degree a metre."""
-    size: PositiveFloat = 300.0
+    size: ExtentM = 300.0
     """Side of the area, metres; generated places and logs are never larger than they are."""
     seed: Seed = 0
     """Another seed, other drives."""
-    out: Path | None = None
+    out: OutputFolder | None = None
     """Folder for observations and truth, out/map/PLACE by default."""
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from manyeyes._bounds import PositiveInt
+from manyeyes._bounds import InputPath, OutputFile, PositiveInt
 from manyeyes.datatypes import ConfigError
 
 
@@ -18,11 +18,11 @@ class Options:
 
     folder: tyro.conf.Positional[Path]
     """The map's folder, of 'map fuse'."""
-    truth: Path | None = None
+    truth: InputPath | None = None
     """A map's folder to hold it against; 'truth' beside the map is found by itself."""
-    observations: Path | None = None
+    observations: InputPath | None = None
     """Observations to draw behind it; a folder 'observations' beside the map is found by itself."""
-    out: Path | None = None
+    out: OutputFile | None = None
     """The page (.html) or picture (.png); map.html in the map's folder by default."""
     max_observations: PositiveInt = 500
     """Draw at most so many observations, which bounds the size of the page."""

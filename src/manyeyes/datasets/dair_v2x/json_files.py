@@ -7,7 +7,6 @@ letters; everything else is left out, and so is a box without size, as in the of
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,17 +14,20 @@ from typing import Any
 import numpy as np
 import torch
 
+from manyeyes._io import parse_json, read_file
 from manyeyes.datatypes import LABELS, Boxes, RecordingError, Transform
+from manyeyes.datatypes.errors import shorten
 
 REMEDY = "copy or download the file again"
 # Published calibrations are rounded; a mirrored or sheared one is farther off than this.
 _NOT_A_ROTATION = 0.02
+_MAX_DEPTH = 8
 
 
 def load_json(path: Path) -> Any:
     """Return the content of a JSON file."""
     try:
-        return json.loads(path.read_bytes())
+        return parse_json(read_file(path))
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file, expected JSON; {REMEDY}.") from None
     except OSError as error:
@@ -55,7 +57,7 @@ def get_text(path: Path, content: Any, key: str, json_path: str = "") -> str:
     """Return a value that has to be a text with something in it."""
     found = get_field(path, content, key, json_path)
     if not isinstance(found, str) or not found:
-        raise RecordingError(f"{path}: expected a text at '{_name(json_path, key)}', found {found!r}; {REMEDY}.")
+        raise RecordingError(f"{path}: expected a text at '{_name(json_path, key)}', found {shorten(found)}; {REMEDY}.")
     return found
 
 
@@ -66,7 +68,9 @@ def get_number(path: Path, content: Any, key: str, json_path: str = "", blank: f
         return blank
     value = _number(found)
     if value is None:
-        raise RecordingError(f"{path}: expected a number at '{_name(json_path, key)}', found {found!r}; {REMEDY}.")
+        raise RecordingError(
+            f"{path}: expected a number at '{_name(json_path, key)}', found {shorten(found)}; {REMEDY}."
+        )
     return value
 
 
@@ -89,15 +93,13 @@ def _array(path: Path, found: object, shape: tuple[int, ...], name: str) -> np.n
     values = _flat(found)
     if values is None or len(values) != int(np.prod(shape)):
         what = " x ".join(map(str, shape))
-        shown = repr(found)
-        shown = shown if len(shown) <= 80 else f"{shown[:77]}..."
-        raise RecordingError(f"{path}: expected {what} finite numbers at '{name}', found {shown}; {REMEDY}.")
+        raise RecordingError(f"{path}: expected {what} finite numbers at '{name}', found {shorten(found)}; {REMEDY}.")
     return np.asarray(values, np.float64).reshape(shape)
 
 
-def _flat(found: object) -> list[float] | None:
-    if isinstance(found, Sequence) and not isinstance(found, str):
-        parts = [_flat(entry) for entry in found]
+def _flat(found: object, depth: int = 0) -> list[float] | None:
+    if isinstance(found, Sequence) and not isinstance(found, str) and depth < _MAX_DEPTH:
+        parts = [_flat(entry, depth + 1) for entry in found]
         return None if any(part is None for part in parts) else [v for part in parts for v in part or ()]
     value = _number(found)
     return None if value is None else [value]
@@ -221,7 +223,7 @@ def _track(path: Path, entry: Mapping[str, Any], row: int) -> int:
     value = get_number(path, entry, "track_id", f"[{row}]")
     if value < 0 or value != int(value):
         raise RecordingError(
-            f"{path}: expected a whole number >= 0 at '[{row}].track_id', found {entry['track_id']!r}; {REMEDY}."
+            f"{path}: expected a whole number >= 0 at '[{row}].track_id', found {shorten(entry['track_id'])}; {REMEDY}."
         )
     return int(value)
 

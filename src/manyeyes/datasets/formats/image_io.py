@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from pathlib import Path
 from types import ModuleType
 
@@ -14,14 +15,22 @@ from torch import Tensor
 from manyeyes._io import atomic_write
 from manyeyes.datatypes import MissingExtraError, RecordingError
 
+MAX_PIXELS = 1 << 26
+"""Maximum number of pixels of a picture: 67 million, 0.2 GB as RGB."""
+
 
 def read_image(path: Path) -> Tensor:
     """Return (3, height, width) uint8, sRGB, of any format that Pillow knows; transparency is dropped."""
     image = _pillow()
     try:
-        with image.open(path) as file:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow's warning of large images; they are refused below
+            file = image.open(path)
+        with file:
+            if file.width * file.height > MAX_PIXELS:
+                raise ValueError(f"{file.width} x {file.height} pixels; at most {MAX_PIXELS:,} in all")
             pixels = np.asarray(file.convert("RGB"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, SyntaxError, image.DecompressionBombError) as error:
         raise RecordingError(
             f"{path}: expected a picture, found something else ({error}); copy the file again."
         ) from None

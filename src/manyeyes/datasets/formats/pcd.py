@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from manyeyes._io import atomic_write
+from manyeyes._io import atomic_write, read_file
 from manyeyes.datasets.formats.cache import ArrayCache
 from manyeyes.datatypes import RecordingError
 
@@ -20,6 +20,8 @@ _KINDS = {"F": "f", "U": "u", "I": "i"}
 _LETTERS = {kind: letter for letter, kind in _KINDS.items()}
 _ENCODINGS = ("ascii", "binary", "binary_compressed")
 _REMEDY = "copy or download the file again"
+_MAX_POINT_BYTES = 4096
+_MAX_CLOUD_BYTES = 1 << 30
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,7 @@ def write_table(path: Path, table: PcdTable) -> None:
 
 def _read(path: Path) -> tuple[_PcdHeader, PcdTable]:
     try:
-        data = path.read_bytes()
+        data = read_file(path)
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file, expected a PCD point cloud; {_REMEDY}.") from None
     except OSError as error:
@@ -167,6 +169,13 @@ def _parse_header(path: Path, data: bytes) -> tuple[_PcdHeader, int]:
         encoding = entries["DATA"][0]
     except (KeyError, ValueError, IndexError, TypeError) as error:
         raise RecordingError(f"{path}: the PCD header's {error} is missing or unknown; {_REMEDY}.") from None
+    point_bytes = sum(max(d.itemsize, 1) * c for d, c in zip(dtypes, counts))
+    if min(counts, default=1) < 1 or point_bytes > _MAX_POINT_BYTES or points * point_bytes > _MAX_CLOUD_BYTES:
+        raise RecordingError(
+            f"{path}: the PCD header's COUNT {' '.join(map(str, counts))[:80]} and POINTS {points} give {point_bytes} bytes a "
+            f"point; expected counts from 1, at most {_MAX_POINT_BYTES:,} bytes a point and {_MAX_CLOUD_BYTES:,} in all; "
+            f"{_REMEDY}."
+        )
     if not len(names) == len(dtypes) == len(counts) or points < 0 or encoding not in _ENCODINGS:
         got = f"{len(names)} FIELDS, {len(dtypes)} TYPE and SIZE, {len(counts)} COUNT, {points} POINTS, DATA {encoding}"
         raise RecordingError(f"{path}: the PCD header contradicts itself or PCD 0.7: {got}; {_REMEDY}.")

@@ -20,6 +20,7 @@ from manyeyes.datasets.formats.image_io import read_image
 from manyeyes.datasets.opv2v.carla import carla_from_transform, transform_from_carla
 from manyeyes.datasets.opv2v.metadata import load_yaml
 from manyeyes.datatypes import Camera, CameraImage, RecordingError, Transform
+from manyeyes.datatypes.errors import shorten
 
 _KIND, _COLUMNS = "opv2v-cameras1", 16
 _MIRROR = torch.diag(torch.tensor([1.0, -1.0, 1.0, 1.0], dtype=torch.float64))
@@ -89,12 +90,13 @@ def read_cameras(yaml: Path, cache: ArrayCache | None = None) -> tuple[CameraRec
 def _row(path: Path, key: str, entry: object) -> list[float]:
     found = entry if isinstance(entry, Mapping) else {}
     try:
-        values = [float(v) for v in found["cords"]] + [float(v) for row in found["intrinsic"] for v in row]
-    except (KeyError, TypeError, ValueError):
+        rows = (found["cords"], *found["intrinsic"])
+        values = [float(v) for row in rows for v in row] if [len(row) for row in rows] == [6, 3, 3, 3] else []
+    except (KeyError, TypeError, ValueError, OverflowError):
         values = []
     if len(values) != _COLUMNS - 1 or not np.isfinite(values).all():
         raise RecordingError(
-            f"{path}: expected six numbers at '{key}.cords' and nine at '{key}.intrinsic', found {entry!r}; "
+            f"{path}: expected six numbers at '{key}.cords' and nine at '{key}.intrinsic', found {shorten(entry)}; "
             "copy or download the file again."
         )
     return values

@@ -11,15 +11,36 @@ from typing import Any
 import numpy as np
 import yaml
 
-from manyeyes._io import atomic_write_text
+from manyeyes._io import MAX_TEXT_BYTES, atomic_write_text, read_file
 from manyeyes.datasets.formats.cache import ArrayCache
 from manyeyes.datatypes import LABELS, RecordingError
+from manyeyes.datatypes.errors import shorten
 
-_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_MAX_MERGED, _MAX_MERGED_ENTRIES = 100, 10_000
+
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # pyright: ignore[reportGeneralTypeIssues]
+    """Safe loader with a bound on merge keys (<<), which copy what they name: nested ones grow exponentially."""
+
+    num_merged = 0
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Merge as yaml 1.1 does, up to the bound."""
+        merged = [value for key, value in node.value if key.tag == "tag:yaml.org,2002:merge"]
+        num_sources = sum(len(value.value) if isinstance(value, yaml.SequenceNode) else 1 for value in merged)
+        if num_sources <= _MAX_MERGED:
+            super().flatten_mapping(node)
+            self.num_merged += len(node.value) if merged else 0
+        if num_sources > _MAX_MERGED or self.num_merged > _MAX_MERGED_ENTRIES:
+            raise yaml.YAMLError(f"'<<' merges more than {_MAX_MERGED} mappings or {_MAX_MERGED_ENTRIES:,} entries")
+
+
 KMH_PER_MPS = 3.6
 _REMEDY = "copy or download the file again"
 # Columns of a kept array: row 0 is the agent, the rows below are the vehicles that it lists.
 _COLUMNS = 16
+_MAX_ID = 2**53
+_MAX_DELTA_S, _MAX_HISTORY_FRAMES = 3600.0, 1_000_000
 _VANS = ("sprinter", "t2", "ambulance")
 _TRUCKS = ("firetruck", "carlacola", "truck")
 _BUSES = ("fusorosa", "bus")
@@ -57,10 +78,10 @@ class DataProtocol:
 def load_yaml(path: Path) -> Mapping[Any, Any]:
     """Return the mapping at the top of a yaml file; anchors and aliases are resolved."""
     try:
-        content = yaml.load(path.read_bytes(), _Loader)
+        content = yaml.load(read_file(path, MAX_TEXT_BYTES), _Loader)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}), expected a yaml file; {_REMEDY}.") from None
-    except (yaml.YAMLError, ValueError) as error:
+    except (yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         reason = " ".join(str(error).split())
         raise RecordingError(f"{path}: expected yaml, found something else ({reason}); {_REMEDY}.") from None
     if not isinstance(content, Mapping):
@@ -75,15 +96,17 @@ def read_protocol(folder: Path) -> DataProtocol:
         return DataProtocol()
     content = load_yaml(path)
     world = content.get("world")
-    delta = world.get("fixed_delta_seconds", 0.05) if isinstance(world, Mapping) else 0.05
+    if not isinstance(world, Mapping | None):
+        raise RecordingError(f"{path}: expected a mapping at 'world', found {shorten(world)}; {_REMEDY}.")
+    delta, history = (world or {}).get("fixed_delta_seconds", 0.05), content.get("history_frames") or 0
     try:
-        protocol = DataProtocol(float(delta), int(content.get("history_frames") or 0))
-    except (TypeError, ValueError):
+        protocol = DataProtocol(float(delta), int(history))
+    except (TypeError, ValueError, OverflowError):
         protocol = DataProtocol(-1.0)
-    if not (protocol.fixed_delta_s > 0 and protocol.history_frames >= 0):
+    if not (0 < protocol.fixed_delta_s <= _MAX_DELTA_S and 0 <= protocol.history_frames <= _MAX_HISTORY_FRAMES):
         raise RecordingError(
-            f"{path}: expected world.fixed_delta_seconds > 0 and history_frames >= 0; got {delta!r} and "
-            f"{content.get('history_frames')!r}: correct them."
+            f"{path}: expected world.fixed_delta_seconds above 0, at most {_MAX_DELTA_S:g}, and history_frames from 0 to "
+            f"{_MAX_HISTORY_FRAMES}; got {shorten(delta)} and {shorten(history)}: correct them."
         )
     return protocol
 
@@ -117,6 +140,8 @@ def _parse(path: Path) -> np.ndarray:
     if vehicles is content:
         remedy = f"{_REMEDY}, or write 'vehicles: {{}}' where nothing is labelled"
         raise RecordingError(f"{path}: expected the key 'vehicles', found none; {remedy}.")
+    if not isinstance(vehicles, Mapping | None):
+        raise RecordingError(f"{path}: expected a mapping at 'vehicles', found {shorten(vehicles)}; {_REMEDY}.")
     rows = np.zeros((1 + len(vehicles or ()), _COLUMNS))
     rows[0, :6] = _numbers(path, content, "lidar_pose", 6)
     rows[0, 6:12] = _numbers(path, content, "true_ego_pos", 6) if content.get("true_ego_pos") is not None else np.nan
@@ -125,11 +150,15 @@ def _parse(path: Path) -> np.ndarray:
     for row, (key, vehicle) in zip(rows[1:], (vehicles or {}).items()):
         yaml_path = f"vehicles.{key}"
         if not isinstance(vehicle, Mapping):
-            raise RecordingError(f"{path}: expected a mapping at '{yaml_path}', found {vehicle!r}; {_REMEDY}.")
+            raise RecordingError(f"{path}: expected a mapping at '{yaml_path}', found {shorten(vehicle)}; {_REMEDY}.")
         try:
             row[0] = int(key)
-        except ValueError:
-            raise RecordingError(f"{path}: expected a whole number as id of '{yaml_path}'; {_REMEDY}.") from None
+            if abs(row[0]) > _MAX_ID:
+                raise ValueError
+        except (TypeError, ValueError, OverflowError):
+            raise RecordingError(
+                f"{path}: expected a whole number up to 2**53 as id of '{yaml_path}'; {_REMEDY}."
+            ) from None
         for start, name in ((2, "location"), (5, "center"), (8, "extent"), (11, "angle")):
             row[start : start + 3] = _numbers(path, vehicle, name, 3, yaml_path)
         row[14] = _numbers(path, vehicle, "speed", 1, yaml_path)[0] if vehicle.get("speed") is not None else 0.0
@@ -149,10 +178,10 @@ def _numbers(path: Path, content: Mapping[Any, Any], key: str, count: int, yaml_
     values = found if isinstance(found, (list, tuple)) else [found]
     try:
         numbers = [float(v) for v in values]
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = []
     if len(numbers) != count or not np.isfinite(numbers).all():
-        raise RecordingError(f"{path}: expected {count} finite numbers at '{name}', found {found!r}; {_REMEDY}.")
+        raise RecordingError(f"{path}: expected {count} finite numbers at '{name}', found {shorten(found)}; {_REMEDY}.")
     return numbers
 
 

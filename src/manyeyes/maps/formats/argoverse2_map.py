@@ -9,13 +9,13 @@ both name it stands in the network twice, as in the file: :mod:`manyeyes.maps.ro
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes._io import parse_json, read_file
 from manyeyes.datatypes import ManyeyesError, MissingExtraError
 from manyeyes.maps.roads.lane_links import build_junctions, complete_lane_links, connected_components, resample_borders
 from manyeyes.maps.roads.road_network import Crossing, Lane, RoadMark, RoadNetwork
@@ -38,7 +38,7 @@ def read_argoverse2_map(source: Path | str) -> RoadNetwork:
     """Return the roads of one log: a ``log_map_archive_*.json``, its ``map`` folder or the log's folder."""
     path = _map_file(Path(source))
     try:
-        root = json.loads(path.read_bytes())
+        root = parse_json(read_file(path))
     except (OSError, ValueError) as error:
         raise Argoverse2MapError(f"{path}: expected an Argoverse 2 vector map in JSON; {error}.") from error
     if not isinstance(root, dict) or not isinstance(root.get("lane_segments"), dict) or not root["lane_segments"]:

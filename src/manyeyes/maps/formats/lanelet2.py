@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes._io import MAX_TEXT_BYTES, read_file
 from manyeyes.datatypes import ManyeyesError, MissingExtraError
 from manyeyes.maps.roads.lane_links import build_junctions, complete_lane_links, connected_components, resample_borders
 from manyeyes.maps.roads.road_network import Crossing, Lane, RoadMark, RoadNetwork
@@ -83,7 +84,7 @@ def lanelet2_origin(source: Path | str) -> tuple[float, float]:
 
 def _root(path: Path) -> ET.Element:
     try:
-        root = ET.fromstring(path.read_bytes())
+        root = ET.fromstring(read_file(path, MAX_TEXT_BYTES))
     except (OSError, ET.ParseError) as error:
         raise Lanelet2Error(f"{path}: expected Lanelet2's OSM XML; {error}.") from error
     if root.tag != "osm":

@@ -18,7 +18,6 @@ A sample that cannot be used (no pose, a ring that crosses itself, a coordinate 
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -28,6 +27,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes._io import parse_json, read_file
 from manyeyes.datatypes import ManyeyesError
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, STOP_LINE, MapElements
 from manyeyes.maps.elements.observation import MapFrame, Observation, ObservationError
@@ -56,6 +56,9 @@ _NUSCENES_ORIGIN = {
     "singapore-hollandvillage": (1.2993652317780957, 103.78217697143555),
     "singapore-queenstown": (1.2782562240223188, 103.76741409301758),
 }
+
+
+_MAX_FILE_BYTES = 1 << 32  # nuScenes' table of all samples has more than 1 GB
 
 
 class ModelResultsError(ManyeyesError):
@@ -308,7 +311,7 @@ def _table(root: Path, name: str, *fields: str) -> Sequence[dict[str, Any]]:
 
 def _json(path: Path) -> Any:
     try:
-        return json.loads(path.read_bytes())
+        return parse_json(read_file(path, _MAX_FILE_BYTES))
     except (OSError, ValueError) as error:
         raise ModelResultsError(f"{path}: expected a JSON file; {error}.") from error
 

@@ -7,7 +7,6 @@ a width is 0.12 m wide, a stop line 0.4 m. A double line becomes two marks whose
 
 from __future__ import annotations
 
-import gzip
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
@@ -16,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from manyeyes._io import MAX_TEXT_BYTES, read_file, unpack_gzip
 from manyeyes.datatypes import ManyeyesError
 from manyeyes.maps.formats.opendrive_geometry import Array, Cubics, Primitive, ReferenceLine
 from manyeyes.maps.formats.opendrive_links import link_lanes, read_junctions
@@ -23,6 +23,8 @@ from manyeyes.maps.roads.road_network import Crossing, Lane, ParkingSpace, Road,
 
 STEP_M = 1.0
 TIGHT_STEP_M = 0.5
+_MAX_LENGTH_M, _MAX_COORDINATE_M, _MAX_POINTS = 1e5, 1e8, 10_000_000
+"""Maximum length of a road, distance from the origin, and number of sampled points of all lanes."""
 _DASH_M, _GAP_M = 3.0, 6.0
 _MARK_WIDTH_M, _STOP_WIDTH_M = 0.12, 0.4
 _DEFAULT_SPEED_MPS = 13.9
@@ -60,15 +62,17 @@ def read_opendrive(source: Path | str | bytes, name: str | None = None, step_m: 
     else:
         label = str(source)
         try:
-            data = Path(source).read_bytes()
+            data = read_file(Path(source), MAX_TEXT_BYTES)
         except OSError as error:
             raise OpenDriveError(
                 f"{label}: cannot be read ({error.strerror}); give the path of an .xodr file."
             ) from error
     try:
-        data = gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
+        data = unpack_gzip(data, MAX_TEXT_BYTES) if data[:2] == b"\x1f\x8b" else data
         root = ET.fromstring(data)
-    except (OSError, EOFError, ET.ParseError) as error:
+    except OSError as error:
+        raise OpenDriveError(f"{label}: expected OpenDRIVE XML, plain or gzip; {error.strerror or error}.") from error
+    except (ET.ParseError, ValueError, LookupError) as error:
         raise OpenDriveError(f"{label}: expected OpenDRIVE XML, plain or gzip; {error}.") from error
     if root.tag != "OpenDRIVE":
         raise OpenDriveError(f"{label}: expected the root element <OpenDRIVE>; got <{root.tag}>.")
@@ -83,6 +87,7 @@ class _OpenDriveReader:
         self.label, self.step_m, self.root = label, step_m, root
         self.lanes: list[Lane] = []
         self.marks: list[RoadMark] = []
+        self.num_points = 0
 
     def network(self, name: str, data: bytes) -> RoadNetwork:
         """Read the whole file into a RoadNetwork."""
@@ -121,6 +126,26 @@ class _OpenDriveReader:
             )
         return value
 
+    def length(self, element: ET.Element, context: str) -> float:
+        """Return the attribute 'length' as a number from 0 to its maximum."""
+        length = self.number(element, "length", context)
+        if not 0 <= length <= _MAX_LENGTH_M:
+            raise OpenDriveError(
+                f"{self.label}: {context} <{element.tag}> needs a 'length' from 0 to {_MAX_LENGTH_M:,.0f} m; got {length:g}."
+            )
+        return length
+
+    def points(self, record: _Record, s: Array, t: Array) -> Array:
+        """Return world points (M, 3) at stations s and lateral offsets t (M,), within bounds."""
+        with np.errstate(all="ignore"):
+            points = record.line.points(s, t)
+        if not (np.abs(points) <= _MAX_COORDINATE_M).all():
+            raise OpenDriveError(
+                f"{self.label}: road {record.id}: expected points within {_MAX_COORDINATE_M:g} m of the origin; "
+                "its geometry, lane widths or heights lead farther or to no number."
+            )
+        return points
+
     def cubics(self, elements: Iterable[ET.Element], context: str, start: str = "s") -> Cubics:
         """Records a, b, c, d over s (or sOffset) as one function; zero everywhere when there are none."""
         rows = [(self.number(e, start, context, 0.0), *(self.number(e, c, context) for c in "abcd")) for e in elements]
@@ -142,7 +167,7 @@ class _OpenDriveReader:
             tuple(sorted(pieces, key=lambda piece: piece.s)),
             self.cubics(road.findall("elevationProfile/elevation"), context),
             self.cubics(road.findall("lateralProfile/superelevation"), context),
-            self.number(road, "length", context),
+            self.length(road, context),
         )
         junction = road.get("junction", "-1")
         return _Record(
@@ -172,8 +197,8 @@ class _OpenDriveReader:
         values = tuple(self.number(shape, key, context) for key in _PARAMETERS[shape.tag])
         if shape.tag == "paramPoly3":
             values = (*values, 0.0 if shape.get("pRange") == "arcLength" else 1.0)
-        s, x, y, heading, length = (self.number(geometry, key, context) for key in ("s", "x", "y", "hdg", "length"))
-        return Primitive(s, x, y, heading, length, shape.tag, values)
+        s, x, y, heading = (self.number(geometry, key, context) for key in ("s", "x", "y", "hdg"))
+        return Primitive(s, x, y, heading, self.length(geometry, context), shape.tag, values)
 
     def road(self, record: _Record) -> Road:
         """Return a road's lanes and marks, appended; and the road itself."""
@@ -182,12 +207,16 @@ class _OpenDriveReader:
             raise OpenDriveError(f"{self.label}: road {record.id}: <lanes> holds no <laneSection>.")
         first = len(self.lanes)
         starts = [self.number(section, "s", f"road {record.id}:") for section in sections]
+        if min(starts) < 0 or max(starts) > record.line.length:
+            raise OpenDriveError(
+                f"{self.label}: road {record.id}: <laneSection> needs an 's' on the road of {record.line.length:g} m."
+            )
         ends = [*starts[1:], record.line.length]
         for k, (section, start, end) in enumerate(zip(sections, starts, ends)):
             if end > start:
                 self.section(record, section, k, start, end)
         s = record.line.stations(0.0, record.line.length, self.step_m, self.step_m / 2, np.zeros(0))
-        reference = record.line.points(s, np.zeros_like(s))
+        reference = self.points(record, s, np.zeros_like(s))
         ids = tuple(range(first, len(self.lanes)))
         return Road(record.id, record.line.length, record.junction_id, reference, s, ids)
 
@@ -203,18 +232,23 @@ class _OpenDriveReader:
         s = record.line.stations(
             start, end, self.step_m, self.step_m / 2, np.array([*offsets, *record.lane_offset.start])
         )
+        self.num_points += len(s) * (1 + sum(1 + len(e.findall("roadMark")) for e in elements.values()))
+        if self.num_points > _MAX_POINTS:
+            raise OpenDriveError(
+                f"{self.label}: road {record.id}: more than {_MAX_POINTS:,} points of lanes; split the file."
+            )
         # Where the lanes are renumbered, <laneOffset> jumps: the section's end takes the value from its own side.
         middle = record.lane_offset(np.concatenate((s[:-1], [s[-1] - 1e-6])))
         if 0 in elements:
             self.border_marks(record, elements[0], index, s, middle, start)
         for side in (1, -1):
             inner = middle
-            inner_points = record.line.points(s, inner)
+            inner_points = self.points(record, s, inner)
             for lane_id in sorted((i for i in elements if i * side > 0), key=abs):
                 element = elements[lane_id]
                 context = f"road {record.id} section {index} lane {lane_id}:"
                 outer = self.outer_border(element, context, s - start, inner, middle, side)
-                outer_points = record.line.points(s, outer)
+                outer_points = self.points(record, s, outer)
                 self.add_lane(record, element, index, lane_id, inner_points, outer_points)
                 self.border_marks(record, element, index, s, outer, start)
                 inner, inner_points = outer, outer_points
@@ -267,7 +301,7 @@ class _OpenDriveReader:
             if within.sum() < 2:
                 continue
             for offset, kind, width, dash, gap in self.lines(mark, context, lane_id):
-                line = record.line.points(s[within], t[within] + offset)
+                line = self.points(record, s[within], t[within] + offset)
                 color = {"standard": "white"}.get(mark.get("color", "standard"), mark.get("color", "white"))
                 self.marks.append(RoadMark(line, kind, color, width, dash, gap, record.id, section, lane_id))
 
@@ -319,10 +353,10 @@ class _OpenDriveReader:
         corners = [e for e in element.iter() if e.tag == "cornerRoad"]
         if corners:
             st = np.array([[self.number(e, key, context) for key in ("s", "t")] for e in corners])
-            points = record.line.points(st[:, 0], st[:, 1])
+            points = self.points(record, st[:, 0], st[:, 1])
             points[:, 2] += [self.number(e, "dz", context, 0.0) for e in corners]
             return _open(points)
-        origin = record.line.points(np.array([s]), np.array([t]))[0]
+        origin = self.points(record, np.array([s]), np.array([t]))[0]
         origin[2] += self.number(element, "zOffset", context, 0.0)
         angle = record.line.pose(np.array([s]))[2][0] + self.number(element, "hdg", context, 0.0)
         local = [e for e in element.iter() if e.tag == "cornerLocal"]

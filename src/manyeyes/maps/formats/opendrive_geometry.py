@@ -84,7 +84,7 @@ def _arc(d: Array, piece: Primitive) -> tuple[Array, Array, Array]:
 def _spiral(d: Array, piece: Primitive) -> tuple[Array, Array, Array]:
     """Clothoid by Gauss-Legendre quadrature of its heading: exact to rounding for every road that can be driven."""
     start, end = piece.parameters
-    rate = (end - start) / piece.length
+    rate = (end - start) / piece.length if piece.length else 0.0
     edges = np.arange(_SPIRAL_PANELS) / _SPIRAL_PANELS
     nodes = (edges[:, None] + (_GAUSS_NODES + 1.0) / (2 * _SPIRAL_PANELS)).ravel()
     weights = np.tile(_GAUSS_WEIGHTS / (2 * _SPIRAL_PANELS), _SPIRAL_PANELS)

@@ -10,7 +10,6 @@ junctions, a border that another such lane has as well is paint between them; on
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -20,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes._io import parse_json, read_file
 from manyeyes.datatypes import ManyeyesError
 from manyeyes.datatypes.extras import import_extra
 from manyeyes.maps.roads.lane_links import build_junctions, complete_lane_links, resample_borders
@@ -53,7 +53,7 @@ def read_v2x_seq_map(path: Path | str, offset_xy: tuple[float, float] = (0.0, 0.
     """
     path = Path(path)
     try:
-        root = json.loads(path.read_bytes())
+        root = parse_json(read_file(path))
     except (OSError, ValueError) as error:
         raise V2xSeqMapError(f"{path}: expected a V2X-Seq vector map in JSON; {error}.") from error
     if not isinstance(root, dict) or not isinstance(root.get("LANE"), dict) or not root["LANE"]:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from manyeyes._bounds import ChannelCount, StageCount
 from manyeyes.datatypes import ConfigError, ShapeError
 from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.detector.proposal_codes import PROPOSAL_CODES, proposal_from_codes, proposal_to_codes
@@ -27,8 +28,8 @@ FREQUENCY_TOTAL = 4096
 class CodebookConfig:
     """stages: number of bytes of a token's features; size: number of centres per stage, at most 256."""
 
-    stages: int = 4
-    size: int = 256
+    stages: StageCount = 4
+    size: ChannelCount = 256
 
     def __post_init__(self) -> None:
         if not (self.stages >= 1 and 1 <= self.size <= 256):

@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from manyeyes._bounds import ChannelCount, FiniteFloat
 from manyeyes.datatypes import BevGrid, Boxes, PointCloud, SparseBev
 from manyeyes.models.detector.box_head import BoxHead, DecodeConfig, RawBoxes, RefineHead, decode
 from manyeyes.models.detector.codebook import Codebook, CodebookConfig
@@ -39,13 +40,13 @@ class DetectorConfig:
 
     grid: BevGrid
     pillars: PillarKind = "points"
-    pillar_channels: int = 32
+    pillar_channels: ChannelCount = 32
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     dast: AttentionConfig = field(default_factory=AttentionConfig)
     fusion: str = "self-attention"
     fusion_attention: AttentionConfig = field(default_factory=AttentionConfig)
-    head_channels: int = 64
-    prune_threshold: float = 0.1
+    head_channels: ChannelCount = 64
+    prune_threshold: FiniteFloat = 0.1
     decode: DecodeConfig = field(default_factory=DecodeConfig)
     output_range: BevGrid | None = None
     sweeps: Literal[1, 2] = 1

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from torch import nn
 
+from manyeyes._bounds import ChannelCount, LayerCount
 from manyeyes.datatypes import ConfigError, SparseBev
 from manyeyes.models.detector.layers import DownLayer, SubmanifoldLayer, SubmanifoldStage, UpLayer
 from manyeyes.models.detector.pruning import FocalPrune, PruneOutput
@@ -29,12 +30,12 @@ class EncoderConfig:
         use_coarse_strides: use strides 16 and 32 (Eq. 3); without them the merge has stride 8 alone.
     """
 
-    channels: tuple[int, ...] = (32, 64, 128, 128, 128, 128)
-    layers: tuple[int, ...] = (2, 3, 4, 3, 2, 2)
+    channels: tuple[ChannelCount, ...] = (32, 64, 128, 128, 128, 128)
+    layers: tuple[LayerCount, ...] = (2, 3, 4, 3, 2, 2)
     prune_strides: tuple[int, ...] = (4, 8)
     head_stride: int = 4
     dilating: bool = False
-    token_channels: int | None = None
+    token_channels: ChannelCount | None = None
     use_coarse_strides: bool = True
 
     def __post_init__(self) -> None:

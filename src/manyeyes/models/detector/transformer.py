@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from manyeyes._bounds import ChannelCount, LayerCount, StageCount
 from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.ops._attention_block_kernels import BlockWeights, run_block
 from manyeyes.ops._window_attention_kernels import attend_in_windows, window_runs
@@ -27,10 +28,10 @@ class AttentionConfig:
         separate_weights: use separate weights per density level, as in the paper.
     """
 
-    window: int = 8
-    blocks: int = 2
-    heads: int = 4
-    expansion: int = 2
+    window: StageCount = 8
+    blocks: LayerCount = 2
+    heads: ChannelCount = 4
+    expansion: StageCount = 2
     density_thresholds: tuple[float, float] = (0.125, 0.25)
     separate_weights: bool = False
 

@@ -17,6 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from manyeyes._bounds import ChannelCount, ImageSide, LayerCount
 from manyeyes.datatypes import BevGrid, ConfigError, PointCloud
 from manyeyes.datatypes.camera import CameraImage
 from manyeyes.models.maps.image_encoder import (
@@ -57,11 +58,11 @@ class BevConfig:
 
     grid: BevGrid
     sensors: tuple[Sensor, ...] = ("lidar",)
-    channels: int = 64
-    raster_channels: int = 32
-    raster_blocks: tuple[int, ...] = (1, 2, 2)
+    channels: ChannelCount = 64
+    raster_channels: ChannelCount = 32
+    raster_blocks: tuple[LayerCount, ...] = (1, 2, 2)
     image_encoder: ImageEncoderConfig = field(default_factory=ImageEncoderConfig)
-    image_size: tuple[int, int] = (224, 400)
+    image_size: tuple[ImageSide, ImageSide] = (224, 400)
     view_transform: ViewTransform = "depth"
     max_pixel_footprint_m: float = math.inf
     heights_m: tuple[float, ...] = (-0.5, 0.0, 0.5, 2.0)

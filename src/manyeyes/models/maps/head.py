@@ -31,6 +31,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from manyeyes._bounds import ChannelCount, LayerCount, StageCount
 from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements
 from manyeyes.models.maps.line_field_head import DUPLICATE_DISTANCE, LineFieldHead, RawLineField, propose_lines
@@ -64,17 +65,17 @@ class MapHeadConfig:
     """
 
     kinds: tuple[str, ...] = ("divider", "boundary", "crossing")
-    num_queries: int = 50
+    num_queries: ChannelCount = 50
     num_points: int = 20
     num_one_to_many_queries: int = 0
     num_learned_queries: int = 0
     num_seeds: int = 160
     min_trace_score: float = 0.2
-    channels: int = 128
-    feedforward_channels: int = 256
-    layers: int = 3
-    heads: int = 8
-    num_sampling_points: int = 4
+    channels: ChannelCount = 128
+    feedforward_channels: ChannelCount = 256
+    layers: LayerCount = 3
+    heads: ChannelCount = 8
+    num_sampling_points: StageCount = 4
     max_elements: int = 50
     score_threshold: float = 0.05
 

@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
+from manyeyes._bounds import ChannelCount, LayerCount
 from manyeyes.datatypes import ConfigError
 
 
@@ -38,10 +39,10 @@ class ImageEncoderConfig:
             time.
     """
 
-    blocks: tuple[int, ...] = (2, 2, 2, 2)
-    stem_channels: int = 64
+    blocks: tuple[LayerCount, ...] = (2, 2, 2, 2)
+    stem_channels: ChannelCount = 64
     bottleneck: bool = False
-    channels: int = 128
+    channels: ChannelCount = 128
     stride: int = 8
     gradient_checkpointing: bool = False
 

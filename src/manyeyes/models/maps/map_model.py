@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
+from manyeyes._bounds import ChannelCount, LayerCount
 from manyeyes.datatypes import BevGrid, ConfigError, PointCloud, Sites, SparseBev, Transform
 from manyeyes.datatypes.camera import CameraImage
 from manyeyes.models.maps.bev import BevConfig, CameraBev, LidarBev
@@ -40,8 +41,8 @@ class MapModelConfig:
 
     bev: BevConfig
     tile: BevGrid
-    token_channels: int = 32
-    neck_blocks: tuple[int, ...] = (1, 1, 1)
+    token_channels: ChannelCount = 32
+    neck_blocks: tuple[LayerCount, ...] = (1, 1, 1)
     head: MapHeadConfig = field(default_factory=MapHeadConfig)
 
     def __post_init__(self) -> None:

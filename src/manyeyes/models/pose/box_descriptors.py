@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from manyeyes._bounds import ChannelCount, StageCount
 from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.datatypes.message import DESCRIPTOR_DIM
 from manyeyes.models.detector.box_head import TYPICAL_SIZE
@@ -43,13 +44,13 @@ class BoxKeypointConfig:
         sample_spacing_m: distance between samples; the default covers a car and a lane on either side.
     """
 
-    in_channels: int = 64
-    descriptor_dim: int = DESCRIPTOR_DIM
-    hidden_channels: int = 128
+    in_channels: ChannelCount = 64
+    descriptor_dim: ChannelCount = DESCRIPTOR_DIM
+    hidden_channels: ChannelCount = 128
     min_score: float = 0.2
     max_keypoints: int = 64
-    num_longitudinal_samples: int = 5
-    num_lateral_samples: int = 3
+    num_longitudinal_samples: StageCount = 5
+    num_lateral_samples: StageCount = 3
     sample_spacing_m: float = 1.6
 
 

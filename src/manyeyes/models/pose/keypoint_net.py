@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from manyeyes._bounds import ChannelCount
 from manyeyes.datatypes import Boxes, ConfigError, ShapeError, SparseBev
 from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat
@@ -69,9 +70,9 @@ class DenseKeypointConfig:
             map).
     """
 
-    in_channels: int = 64
-    widths: tuple[int, ...] = (128, 128, 256)
-    descriptor_dim: int = 256
+    in_channels: ChannelCount = 64
+    widths: tuple[ChannelCount, ...] = (128, 128, 256)
+    descriptor_dim: ChannelCount = 256
     min_score: float = 0.2
     nms_radius_m: float = 2.4
     border_cells: int = 2

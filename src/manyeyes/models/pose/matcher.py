@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from manyeyes._bounds import ChannelCount, LayerCount
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.models.pose.neighbour_geometry import NeighbourGeometryConfig, NeighbourGeometryEncoder
@@ -40,10 +41,10 @@ class MatcherConfig:
         neighbour_geometry: settings of the rotation-invariant neighbour encoding; None as published.
     """
 
-    descriptor_dim: int = 256
-    width: int = 256
-    layers: int = 9
-    heads: int = 4
+    descriptor_dim: ChannelCount = 256
+    width: ChannelCount = 256
+    layers: LayerCount = 9
+    heads: ChannelCount = 4
     position_unit_m: float = 100.0
     frequency_std: float = 1.0
     min_match_prob: float = 0.1

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from manyeyes._bounds import ChannelCount
+
 WAVELENGTHS_M = (4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 """Wavelengths of the sine encoding of distances."""
 RELATION_DIM = 2 * len(WAVELENGTHS_M) + 4 + 2
@@ -23,7 +25,7 @@ class NeighbourGeometryConfig:
     """max_distance_m: objects farther away are ignored. hidden: width of the hidden layer."""
 
     max_distance_m: float = 60.0
-    hidden: int = 64
+    hidden: ChannelCount = 64
 
 
 class NeighbourGeometryEncoder(nn.Module):

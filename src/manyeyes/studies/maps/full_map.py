@@ -21,6 +21,7 @@ from manyeyes.evaluation.maps.pooled_ap import (
     bootstrap_pooled_ap,
     collect_blocks,
 )
+from manyeyes.evaluation.maps.registry import check_method
 from manyeyes.evaluation.maps.spatial_bootstrap import BLOCK_SIZE_M
 from manyeyes.evaluation.statistics.bootstrap import BootstrapSamples, Interval
 from manyeyes.evaluation.statistics.comparison import Comparison
@@ -90,6 +91,8 @@ class TownResults:
 
 def run(options: FullMapOptions, context: StudyContext) -> None:
     """Run the study of full maps and write its report."""
+    for method in options.methods:
+        check_method(method)
     study = prepare_map_study(options, context)
     if len(study.models) > 1:
         raise ConfigError(f"The study 'full-map' takes one model: name it with --weights; got {len(study.models)}.")

@@ -21,6 +21,7 @@ from manyeyes.evaluation.statistics.bootstrap import Interval, mean_interval
 from manyeyes.evaluation.statistics.comparison import Comparison
 from manyeyes.maps.registry import OURS, list_map_fusions
 from manyeyes.simulator.fleet.config import CROWDS
+from manyeyes.simulator.fleet.place import check_place
 from manyeyes.studies.engine.report import StudyContext
 from manyeyes.studies.maps.fleet_cells import MEAN_AP, FleetJob, FleetResult
 from manyeyes.studies.options import FleetPoseNoiseOptions, FusionOptions, MapFusionStudyOptions
@@ -49,6 +50,9 @@ def run(options: MapFusionStudyOptions, context: StudyContext) -> None:
     """Run one of the three studies of this module and write its report."""
     for method in options.methods:
         check_method(method)
+    if isinstance(options, FleetPoseNoiseOptions):
+        for place in options.places:
+            check_place(place)
     methods = (*(options.methods or list_map_fusions()), *(ORACLES if options.oracles else ()))
     settings, store = make_tuned_settings(), context.store
     jobs = [FleetJob(trial, methods, settings, store) for trial in make_trials(options, range(options.seeds))]

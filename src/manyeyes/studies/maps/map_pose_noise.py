@@ -30,8 +30,8 @@ ROW_NAMES = (SINGLE_VEHICLE, CLEAN, NOISY, CORRECTED, CLEAN_CORRECTED)
 
 def run(options: MapPoseNoiseOptions, context: StudyContext) -> None:
     """Run the study of map tiles under pose noise and write its report."""
-    study = prepare_map_study(options, context)
     predictor = PoseNoisePredictor(pose_correction=PoseCorrection(options.pose_correction))
+    study = prepare_map_study(options, context)
     tile_tables = study.predict_tables(predictor)
     rows = {sensors: [table.make_row(name) for name in ROW_NAMES] for sensors, table in tile_tables.items()}
     comparisons = [c for sensors, table in tile_tables.items() for c in make_comparisons(sensors, table)]
