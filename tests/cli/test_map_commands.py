@@ -139,7 +139,7 @@ def spoil_cut(folder: Path) -> Path:
         (("simulate", "cross", "--crowd", "shy"), ("shy", "colluding-malicious")),
         (("fuse", "{here}"), ("{here}", "Parquet")),
         (("fuse", "{here}", "--method", "guess"), ("guess", "chamfer-nms")),
-        (("evaluate", "{here}"), ("truth", "--truth")),
+        (("evaluate", "{here}"), ("{here}", "lines.parquet")),
         (("view", "{here}"), ("{here}", "lines.parquet")),
         (("view", "{here}", "--out", "x.jpg"), ("x.jpg", ".html")),
         (("diff", "{here}", "{here}", "--out", "x.txt"), ("x.txt", ".json")),

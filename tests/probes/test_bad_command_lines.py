@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -118,7 +119,7 @@ train --data {rec} --split test --weights {missing}.safetensors | {missing}.safe
 evaluate --data {rec} --split test --protocol opencod | opencood
 evaluate --data {rec} --split test --methods intermedite | intermediate
 replay {rec} --split test --scenario zzz | zzz
-replay {rec} --split test --scenario aa --frame 1000000 | 1000000
+replay {rec} --split test --weights {weights} --scenario aa --frame 1000000 | 1000000
 view {rec} --split test --frame 99 | 99
 view {rec} --split test --detect lat | late
 pose {rec} --split test --correctors votin | voting
@@ -186,6 +187,11 @@ view {rec} --split test --out {folder} | {folder}
 view {rec} --half-extent-m 0.1 10000 | --half-extent-m
 view {rec} --split test --out {text}/a.png | {text}
 view {damaged} --split test | vehicles
+replay {short} --split test --weights {weights} | aa
+evaluate --data {short} --split test --weights {weights} --workers 1 --out {folder}/e | aa
+pose {short} --split test --weights {weights} --out {folder}/p | aa
+view {short} --split test | aa
+fit-codebook --data {short} --split test --weights {weights} --out {folder}/w.safetensors | no agent shares
 pose {folder} | {folder}
 pose {rec} --split test --weights {weights} --out {text} | {text}
 fit-codebook --data {rec} --out x.safetensors --weights {missing} | {missing}
@@ -261,6 +267,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     for index in range(3):
         writer.write(make_snapshot("aa", index))
     writer.close({"history_frames": 1})
+    shutil.copytree(root / "damaged", root / "short")
+    (root / "short" / "test" / "aa" / "data_protocol.yaml").write_text("history_frames: 1000\n")
     for yaml in (root / "damaged").rglob("0*.yaml"):
         yaml.write_text("lidar_pose: abc\nvehicles: 5\n")
     with torch.random.fork_rng():
@@ -273,7 +281,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     assert cli.main(f"map simulate cross --observations 4 --size 60 --out {root / 'fleet'}".split()) == 0
     assert cli.main(f"map fuse {root / 'fleet'}".split()) == 0
     return {
-        "rec": root / "rec", "damaged": root / "damaged", "weights": root / "tiny.safetensors", "text": root / "notes.txt",
+        "rec": root / "rec", "damaged": root / "damaged", "short": root / "short", "weights": root / "tiny.safetensors", "text": root / "notes.txt",
         "folder": root / "folder", "empty": root / "empty", "missing": root / "missing",
         "obs": root / "fleet" / "observations", "map": root / "fleet" / "map",
     }  # fmt: skip

@@ -52,7 +52,7 @@ def _evaluate(options: Options) -> None:
     from manyeyes.datasets.registry import open_recording
     from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, load_detector, resolve_protocol, run_benchmark
     from manyeyes.studies import provenance
-    from manyeyes.studies.recordings import adapt_to_dataset, check_files
+    from manyeyes.studies.recordings import adapt_to_dataset, check_evaluated_frames, check_files
     from manyeyes.viz.progress import track
     from manyeyes.viz.results import print_comparison, summarize_comparison
     from manyeyes.viz.table import DIFFERENCE_HEADINGS, format_difference_cells, format_markdown, format_markdown_lines
@@ -71,6 +71,7 @@ def _evaluate(options: Options) -> None:
     protocol, detector = resolve_protocol(config), load_detector(config.weights)
     opener = partial(open_recording, options.data, options.split)
     recording = opener()
+    check_evaluated_frames(recording, recording.scenarios)
     config = replace(config, replay=adapt_to_dataset(config.replay, options.replay_options, recording))
     missing = check_files(recording, options.checks, console)
     with track(console, "Evaluating", len(recording.scenarios)) as report:

@@ -106,7 +106,7 @@ def _evaluate_poses(options: Options) -> None:
     from manyeyes.models import pretrained
     from manyeyes.pose.registry import find_corrector
     from manyeyes.studies import provenance
-    from manyeyes.studies.recordings import check_files, select_checked_scenarios
+    from manyeyes.studies.recordings import check_evaluated_frames, check_files, select_checked_scenarios
     from manyeyes.viz.table import make_table, missing_footer
 
     console = Console()
@@ -117,6 +117,7 @@ def _evaluate_poses(options: Options) -> None:
     noise = PoseNoise("collaborators_iid", options.noise_xy_m, math.radians(options.noise_yaw_deg), options.seed)
     recording = open_recording(options.recording, options.split)
     drive = make_excerpt(recording, options.scenario, options.frames)
+    check_evaluated_frames(drive, drive.scenarios)
     if len(drive.agents(drive.scenario)) < 2:
         raise ConfigError(
             f"{options.recording}: '{drive.scenario}' has one agent, poses are corrected between two; choose another."

@@ -53,13 +53,19 @@ def _replay(options: Options) -> None:
 
     from manyeyes.datasets.registry import open_recording
     from manyeyes.models import pretrained
-    from manyeyes.studies.recordings import adapt_to_dataset, check_files, select_checked_scenarios
+    from manyeyes.studies.recordings import (
+        adapt_to_dataset,
+        check_evaluated_frames,
+        check_files,
+        select_checked_scenarios,
+    )
     from manyeyes.studies.replay_report import REPORT, ReportSpec, replay_and_report
 
     console = Console()
     replay = options.replay_options.make_replay_config(options.seed)
     recording = open_recording(options.recording, options.split)
     drive = make_excerpt(recording, options.scenario, options.frames)
+    check_evaluated_frames(drive, drive.scenarios)
     scenarios = select_checked_scenarios(recording, drive.scenario, options.scenario)
     missing = check_files(recording, options.checks, console, scenarios)
     split = f" --split {options.split}" if options.split else ""

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from manyeyes.agents.replay import ReplayConfig
-    from manyeyes.datasets.base import RecordingReader
+    from manyeyes.datasets.base import Recording, RecordingReader
     from manyeyes.studies.replay_options import FileChecks, ReplayOptions
 
 _MAX_NOTES = 8
@@ -52,6 +52,15 @@ def check_files(
     for line in mismatched[:_MAX_NOTES]:
         console.print(f"note: {line}", highlight=False, markup=False, soft_wrap=True)
     return missing
+
+
+def check_evaluated_frames(recording: Recording, scenarios: Collection[str]) -> None:
+    """Raise RecordingError where none of the scenarios has an evaluated frame."""
+    if not any(len(recording.eval_indices(name)) for name in scenarios):
+        names = ", ".join(list(scenarios)[:_MAX_NOTES])
+        raise RecordingError(
+            f"{names}: no frame is evaluated, as data_protocol.yaml makes all of them history (history_frames); correct it."
+        )
 
 
 def print_notes(recording: RecordingReader, console: Console, scenarios: Collection[str] | None = None) -> None:

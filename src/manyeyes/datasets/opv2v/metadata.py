@@ -157,7 +157,7 @@ def _parse(path: Path) -> np.ndarray:
                 raise ValueError
         except (TypeError, ValueError, OverflowError):
             raise RecordingError(
-                f"{path}: expected a whole number up to 2**53 as id of '{yaml_path}'; {_REMEDY}."
+                f"{path}: expected a whole number as id of '{yaml_path}', at most 2**53; {_REMEDY}."
             ) from None
         for start, name in ((2, "location"), (5, "center"), (8, "extent"), (11, "angle")):
             row[start : start + 3] = _numbers(path, vehicle, name, 3, yaml_path)
