@@ -281,8 +281,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     assert cli.main(f"map simulate cross --observations 4 --size 60 --out {root / 'fleet'}".split()) == 0
     assert cli.main(f"map fuse {root / 'fleet'}".split()) == 0
     return {
-        "rec": root / "rec", "damaged": root / "damaged", "short": root / "short", "weights": root / "tiny.safetensors", "text": root / "notes.txt",
-        "folder": root / "folder", "empty": root / "empty", "missing": root / "missing",
+        "rec": root / "rec", "damaged": root / "damaged", "short": root / "short", "weights": root / "tiny.safetensors",
+        "text": root / "notes.txt", "folder": root / "folder", "empty": root / "empty", "missing": root / "missing",
         "obs": root / "fleet" / "observations", "map": root / "fleet" / "map",
     }  # fmt: skip
 
@@ -322,7 +322,9 @@ def test_a_bad_command_line_is_one_line(
         code = cli.main(shlex.split(line))
     finally:
         signal.alarm(0)
-    check(code, *capsys.readouterr(), expected, time.monotonic() - start)
+    seconds = time.monotonic() - start
+    output = capsys.readouterr()
+    check(code, str(output.out), str(output.err), expected, seconds)
 
 
 @pytest.mark.skipif(not LONG, reason="set MANYEYES_PROBES=long")

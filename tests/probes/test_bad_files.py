@@ -289,7 +289,7 @@ def main(folder: Path) -> None:
 
     torch.set_num_threads(1)
     size = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    resource.setrlimit(resource.RLIMIT_AS, (size + MAX_GROWTH_BYTES,) * 2)
+    resource.setrlimit(resource.RLIMIT_AS, (size + MAX_GROWTH_BYTES, size + MAX_GROWTH_BYTES))
     for number, name in enumerate(CASES):
         (folder / str(number)).mkdir()
         check(name, folder / str(number))
