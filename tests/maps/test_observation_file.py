@@ -113,6 +113,10 @@ def _kind(row: dict) -> None:
     row["elements"][1]["kind"] = "tree"
 
 
+def _no_kind(row: dict) -> None:
+    row["elements"][1]["kind"] = None
+
+
 def _score(row: dict) -> None:
     row["elements"][1]["score"] = 1.5
 
@@ -144,6 +148,7 @@ def _moved(row: dict) -> None:
         (_no_point, "points: expected finite"),
         (_bow_tie, "cross"),
         (_kind, "kind: expected one of divider, boundary, crossing, stop_line; got tree"),
+        (_no_kind, "kind: expected one of divider, boundary, crossing, stop_line"),
         (_score, "score: expected values in .0, 1.; got 1.5"),
         (_style, "style"),
         (_covariance, "covariance: expected 6 numbers"),

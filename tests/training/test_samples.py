@@ -210,6 +210,12 @@ def test_delayed_view_equals_the_view_at_that_time(toy, name):
     assert set(ages) == {0.1, 0.2, 0.3}
 
 
+def test_without_delays_every_view_is_of_now(toy):
+    for number in range(4):
+        some = driven(toy(), AUGMENTS["none"], dataclasses.replace(LATE, delay_prob=0.0), number=number)
+        assert len(some.views) > 1 and {view.age_s for view in some.views} == {0.0}
+
+
 @pytest.mark.parametrize("name", ("none", "all"))
 def test_ego_history_is_newest_first_and_without_pose_noise(toy, name):
     road = dataclasses.replace(LATE, pose_noise_prob=1.0, max_sigma_xy_m=5.0)
