@@ -57,6 +57,7 @@ def test_the_card_of_the_weights_holds_the_run(toy, tmp_path):
     card = checkpoint.read_card(weights)
     assert card["seed"] == 1 and card["steps"] == 2 and card["command"] == "x"
     assert card["config"]["detector"]["head_channels"] == 32 and checkpoint.load(weights).fingerprint
+    assert len(checkpoint.load(weights).token_peaks or ()) == checkpoint.load(weights).token_channels
 
 
 def test_the_prune_threshold_grows_between_two_fractions_of_the_run():

@@ -215,6 +215,7 @@ def test_train_writes_weights_with_their_towns_and_a_log(tmp_path):
     )
     card = checkpoint.read_card(weights, FORMAT)
     assert card["towns"] == ["Nowhere"] and card["steps"] == 4 and card["command"] == "x"
+    assert len(card["token_peaks"]) == TINY.token_channels and min(card["token_peaks"]) > 0
     again = checkpoint.load_as(weights, FORMAT, MapModelConfig, MapModel)
     assert again.config == TINY and torch.equal(again.logit_scale, torch.ones(3))
 

@@ -36,7 +36,6 @@ from manyeyes.agents.token_codec import (
 from manyeyes.comms import wire
 from manyeyes.comms.inbox import Inbox, ReceivedMessage, Rejection
 from manyeyes.comms.receiver_limits import ReceiverLimits
-from manyeyes.comms.token_format import clamp_features
 from manyeyes.comms.token_selection import select_within_budget
 from manyeyes.comms.wire import TokenEncoding
 from manyeyes.datatypes import AgentFrame, Boxes, Message, SparseBev
@@ -157,7 +156,7 @@ class Agent:
 
     def _select(self, message: Message, tokens: SparseBev, budget_bytes: int | None) -> tuple[Message, Message]:
         """Return the message with the tokens that fit into a budget, as the detector made them, and as they are encoded."""
-        tokens = tokens.with_features(clamp_features(tokens.features))
+        tokens = tokens.with_features(self.token_format.clamp(tokens.features))
         is_coded, tables = self.token_encoding == "codebook", self.token_format.tables
         encoded = quantise_tokens(tokens, self.perception_cache.detector) if is_coded else tokens
         score = torch.ones(len(tokens.sites)) if message.token_score is None else message.token_score

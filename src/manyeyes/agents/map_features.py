@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 import torch
 
 from manyeyes.comms import wire
-from manyeyes.comms.token_format import TokenFormat, TokenRefusal, clamp_features
+from manyeyes.comms.token_format import TokenFormat, TokenRefusal
 from manyeyes.comms.token_selection import select_within_budget
 from manyeyes.comms.wire import TokenEncoding
 from manyeyes.datatypes import AgentFrame, Boxes, Message, Sites, SparseBev, Transform
@@ -38,7 +38,7 @@ def encode_map_features(
         features = model.extract_features(
             [frame.points] if "lidar" in sensors else (), [frame.images] if "camera" in sensors else ()
         )
-    clamped = features.tokens.with_features(clamp_features(features.tokens.features))
+    clamped = features.tokens.with_features(make_map_token_format(model).clamp(features.tokens.features))
     tokens, score = select_within_budget(clamped, features.cell_score, budget_bytes, token_encoding)
     if not len(tokens.sites):
         return []
@@ -54,6 +54,11 @@ def encode_map_features(
         objects=objects,
     )
     return wire.encode(message, token_encoding=token_encoding)
+
+
+def make_map_token_format(model: MapModel) -> TokenFormat:
+    """Return the format of the tokens of a map model."""
+    return TokenFormat(model.fingerprint, model.token_grid, model.config.token_channels, peaks=model.token_peaks)
 
 
 def decode_map_features(packets: Iterable[bytes], model: MapModel) -> Message | None:
@@ -76,8 +81,7 @@ def find_token_refusal(message: Message, model: MapModel) -> TokenRefusal | None
         return None
     if message.fingerprint != model.fingerprint:
         return "wrong_model"
-    token_format = TokenFormat(model.fingerprint, model.token_grid, model.config.token_channels)
-    return token_format.check_tokens(message.tokens)
+    return make_map_token_format(model).check_tokens(message.tokens)
 
 
 def predict_tile(model: MapModel, messages: Sequence[Message], world_from_tile: Transform) -> MapElements:

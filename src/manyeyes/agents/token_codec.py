@@ -35,7 +35,8 @@ def make_token_format(detector: BoxDetector) -> TokenFormat:
         return TokenFormat(detector.fingerprint, detector.grid, 0)
     codebook = detector.codebook
     tables = None if codebook is None else CodeTables(detector.fingerprint, codebook.frequencies.numpy())
-    return TokenFormat(detector.fingerprint, detector.token_grid, detector.token_channels, tables)
+    peaks = getattr(detector, "token_peaks", None)
+    return TokenFormat(detector.fingerprint, detector.token_grid, detector.token_channels, tables, peaks)
 
 
 def quantise_tokens(tokens: SparseBev, detector: BoxDetector) -> SparseBev:

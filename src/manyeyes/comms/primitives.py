@@ -294,11 +294,11 @@ def _are_finite(raw: U8x1, at: int, size: int) -> bool:  # pragma: no cover
     return not bad
 
 
-def max_magnitude(data: bytes, size: int) -> float:
-    """Return the largest magnitude of little-endian floats of size bytes, 2 or 4, none of them NaN; at least one float."""
+def max_magnitudes(data: bytes, size: int, columns: int) -> NDArray[np.float32]:
+    """Return the largest magnitude of each column of rows of little-endian floats of size bytes, 2 or 4, none of them NaN."""
     # Without their signs, the bits of floats are in the order of their values.
-    bits = np.frombuffer(data, f"<u{size}") & np.array((1 << 8 * size - 1) - 1, f"<u{size}")
-    return float(np.frombuffer(bits.max().tobytes(), f"<f{size}")[0])
+    bits = np.frombuffer(data, f"<u{size}").reshape(-1, columns) & np.array((1 << 8 * size - 1) - 1, f"<u{size}")
+    return bits.max(0).view(f"<f{size}").astype(np.float32)
 
 
 def _scales() -> NDArray[np.float32]:

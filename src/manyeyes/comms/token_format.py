@@ -7,10 +7,12 @@ is therefore compared for equality, not for plausibility.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from manyeyes.comms import primitives
@@ -21,7 +23,11 @@ from manyeyes.datatypes import BevGrid, SparseBev
 TokenRefusal = Literal["wrong_model", "grid", "width", "value"]
 
 MAX_TOKEN_VALUE = 32.0
-"""Largest magnitude of a value that is sent; senders clamp theirs to it."""
+"""Largest magnitude of a value that is sent."""
+PEAK_FACTOR = 4.0
+"""Largest magnitude of a channel, as a multiple of its peak in training."""
+MIN_PEAK = 2.0
+"""Channels with smaller peaks are bounded as if they had this one."""
 _ROUNDING = 1.01
 """int8 rounds a value up by half a step at most, 1/254 of the largest."""
 
@@ -31,13 +37,21 @@ class TokenFormat:
     """The form of one model's tokens.
 
     fingerprint: 8 bytes that name the weights. grid: the lattice of the tokens. channels: of a row of floats. tables: of the
-    codebook, whose rows of codes are read by them; None where the weights have none.
+    codebook, whose rows of codes are read by them; None where the weights have none. peaks: of each channel's magnitude in
+    training; None bounds all channels by MAX_TOKEN_VALUE. max_values: (channels,) bounds that follow from them.
     """
 
     fingerprint: bytes
     grid: BevGrid
     channels: int
     tables: CodeTables | None = None
+    peaks: tuple[float, ...] | None = None
+    max_values: NDArray[np.float32] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        peaks = [MAX_TOKEN_VALUE] * self.channels if self.peaks is None else self.peaks
+        bounds = np.minimum(PEAK_FACTOR * np.maximum(peaks, MIN_PEAK), MAX_TOKEN_VALUE)
+        object.__setattr__(self, "max_values", bounds.astype(np.float32))
 
     def check_packet(self, fingerprint: bytes, rows: TokenRows) -> TokenRefusal | None:
         """Why the tokens of one packet are not of this form; None where they are."""
@@ -49,7 +63,8 @@ class TokenFormat:
             return None if self.tables is not None and rows.channels == self.tables.width else "width"
         if rows.channels != self.channels:
             return "width"
-        return None if max_magnitude(rows) <= MAX_TOKEN_VALUE * _ROUNDING else "value"
+        within = not len(rows.key) or bool((max_magnitudes(rows) <= self.max_values * _ROUNDING).all())
+        return None if within else "value"
 
     def check_tokens(self, tokens: SparseBev) -> TokenRefusal | None:
         """Return the same of tokens that were read already, rows of floats (N, channels)."""
@@ -58,23 +73,21 @@ class TokenFormat:
         if not tokens.features.is_floating_point() or tokens.features.shape[1] != self.channels:
             return "width"
         # NaN is within no bound.
-        within = tokens.features.abs() <= MAX_TOKEN_VALUE * _ROUNDING
+        within = tokens.features.abs() <= torch.from_numpy(self.max_values * _ROUNDING)
         return None if bool(within.all()) else "value"
 
+    def clamp(self, features: Tensor) -> Tensor:
+        """Return features (N, channels) as they may be sent."""
+        bound = torch.from_numpy(self.max_values)
+        return features.clamp(-bound, bound)
 
-def clamp_features(features: Tensor) -> Tensor:
-    """Return features (N, C) as they may be sent: clamped to MAX_TOKEN_VALUE."""
-    return features.clamp(-MAX_TOKEN_VALUE, MAX_TOKEN_VALUE)
 
-
-def max_magnitude(rows: TokenRows) -> float:
-    """Return the largest magnitude among the float values of a packet; 0 of none."""
-    if not len(rows.key):
-        return 0.0
+def max_magnitudes(rows: TokenRows) -> NDArray[np.float32]:
+    """Return the largest magnitude of each channel of the float values of a packet, which has cells."""
     if rows.encoding == "int8":
         scale = primitives.dequantise_int8(
             np.frombuffer(rows.scales, np.uint8), np.full((1, rows.channels), 127, np.int8)
         )
         steps = np.frombuffer(rows.values, np.int8).reshape(-1, rows.channels)
-        return float((np.abs(steps.astype(np.int16)).max(0) / 127 * scale[0]).max())
-    return primitives.max_magnitude(rows.values, 4 if rows.encoding == "float32" else 2)
+        return np.abs(steps.astype(np.int16)).max(0) / np.float32(127) * scale[0]
+    return primitives.max_magnitudes(rows.values, 4 if rows.encoding == "float32" else 2, rows.channels)

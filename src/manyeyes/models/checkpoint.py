@@ -23,6 +23,7 @@ from manyeyes._io import atomic_write, parse_json
 from manyeyes.datatypes import BevGrid, CheckpointError, ConfigError
 from manyeyes.datatypes.errors import shorten
 from manyeyes.models.detector.detector import Detector, DetectorConfig
+from manyeyes.models.token_peaks import read_token_peaks
 
 FORMAT = "manyeyes-detector-1"
 """Format name in the metadata of a detector's file; models of other types have their own."""
@@ -143,6 +144,7 @@ def load(path: Path) -> Detector:
     """Load a detector in evaluation mode."""
     model = load_as(path, FORMAT, DetectorConfig, Detector)
     model.fingerprint = fingerprint(model)
+    model.token_peaks = read_token_peaks(read_card(path), model.token_channels, path)
     return model
 
 

@@ -18,6 +18,7 @@ from manyeyes.models.detector.protocols import BoxDetector, check_detector
 from manyeyes.models.maps.map_model import MapModel, MapModelConfig
 from manyeyes.models.maps.presets import FORMAT
 from manyeyes.models.pose import feakm
+from manyeyes.models.token_peaks import read_token_peaks
 
 DEFAULT_DETECTOR = "costr-small"
 DEFAULT_FEAKM = "feakm-small"
@@ -84,6 +85,8 @@ def load_map_model(name_or_path: str | Path = DEFAULT_MAP_MODEL) -> MapModel:
     """
     with _weights_file(name_or_path, list_map_models()) as path:
         model = checkpoint.load_as(path, FORMAT, MapModelConfig, MapModel)
+        card = checkpoint.read_card(path, FORMAT)
+        model.token_peaks = read_token_peaks(card, model.config.token_channels, path)
     model.fingerprint = checkpoint.fingerprint(model)
     return model
 

@@ -70,6 +70,7 @@ class Detector(nn.Module):
         self.config = config
         self.grid, self.detection_range = config.grid, config.output_range or config.grid
         self.fingerprint = bytes(8)
+        self.token_peaks: tuple[float, ...] | None = None
         self.pillars = PillarEncoder(config.grid, config.pillar_channels, config.pillars, config.sweeps)
         self.encoder = SparseEncoder(config.pillar_channels, config.encoder)
         channels = self.encoder.out_channels

@@ -73,6 +73,7 @@ class MapModel(nn.Module):
         super().__init__()
         self.config = config
         self.fingerprint = bytes(8)
+        self.token_peaks: tuple[float, ...] | None = None
         bev, head, tokens = config.bev, config.head, config.token_channels
         self.lidar = LidarBev(bev) if "lidar" in bev.sensors else None
         self.camera = CameraBev(bev) if "camera" in bev.sensors else None

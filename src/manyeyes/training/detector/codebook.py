@@ -132,5 +132,5 @@ def with_codebook(detector: Detector, tokens: Tensor, seed: int, config: Codeboo
     weights = {k: v for k, v in detector.state_dict().items() if not k.startswith("codebook.")}
     fitted.load_state_dict(weights | {f"codebook.{k}": v for k, v in book.state_dict().items()})
     fitted.eval().requires_grad_(False)
-    fitted.fingerprint = fingerprint(fitted)
+    fitted.fingerprint, fitted.token_peaks = fingerprint(fitted), detector.token_peaks
     return fitted

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,6 +15,7 @@ from manyeyes.datasets.base import Recording
 from manyeyes.datatypes import CheckpointError
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector, DetectorConfig
+from manyeyes.models.token_peaks import CARD_KEY, NUM_SAMPLES, measure_token_peaks
 from manyeyes.training.detector.losses import LossConfig
 from manyeyes.training.detector.samples import AugmentConfig, DegradationConfig, Sample, SampleStream, epoch_length
 from manyeyes.training.detector.step import loss_terms
@@ -96,6 +98,17 @@ class DetectorTask(Task[DetectorTrainConfig, Detector, Sample]):
         threshold = prune_threshold(config, step, self.steps)
         terms = loss_terms(model, samples, config.targets, threshold, config.loss.fusion_weight, config.loss.target)
         return terms.total(config.loss), vars(terms)
+
+    def finish(self, model: Detector) -> dict[str, Any]:
+        """Measure the range of the tokens on samples after those of training."""
+        first, was = self.steps * self.config.batch, model.training
+        model.eval()
+        views = (view for number in range(first, first + NUM_SAMPLES) for view in self.draw(number).views)
+        with torch.inference_mode():
+            tokens = (model.extract_tokens(view.cloud, view.previous_cloud)[0].features for view in views)
+            peaks = measure_token_peaks(tokens, model.token_channels)
+        model.train(was)
+        return {CARD_KEY: peaks}
 
 
 def _load_weights(model: Detector, start: Path) -> None:

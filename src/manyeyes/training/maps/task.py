@@ -7,16 +7,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.models.maps.map_model import MapModel, MapModelConfig
 from manyeyes.models.maps.presets import FORMAT
+from manyeyes.models.token_peaks import CARD_KEY, NUM_SAMPLES, measure_token_peaks
 from manyeyes.ops.keyed_random import keyed_uniform
 from manyeyes.training.maps.losses import MapLossConfig
 from manyeyes.training.maps.samples import MapAugmentConfig, MapSample, MapSamples
 from manyeyes.training.maps.score_calibration import calibrate_scores
-from manyeyes.training.maps.step import loss_terms
+from manyeyes.training.maps.step import extract_features, loss_terms
 from manyeyes.training.trainer import Task, TrainConfig
 
 _CALIBRATION_TENSORS = ("logit_scale", "logit_shift")
@@ -90,10 +92,16 @@ class MapTask(Task[MapTrainConfig, MapModel, MapSample]):
         return terms.total(config.loss), vars(terms)
 
     def finish(self, model: MapModel) -> dict[str, Any]:
-        """Calibrate the scores on tiles after those of training."""
-        first = self.steps * self.config.batch
+        """Calibrate the scores, and measure the range of the tokens, on tiles after those of training."""
+        first, was = self.steps * self.config.batch, model.training
         calibrate_scores(model, map(self.draw, range(first, first + self.config.calibration_tiles)))
-        return {"towns": list(self.samples.towns)}
+        model.eval()
+        with torch.inference_mode():
+            tiles = map(self.draw, range(first, first + NUM_SAMPLES))
+            tokens = (extract_features(model, [tile]).tokens.features for tile in tiles)
+            peaks = measure_token_peaks(tokens, model.config.token_channels)
+        model.train(was)
+        return {"towns": list(self.samples.towns), CARD_KEY: peaks}
 
 
 def _begin_from(model: MapModel, start: Sequence[Mapping[str, Tensor]]) -> None:
