@@ -100,7 +100,7 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
         _GEOPACKAGE.when("format", "geopackage", "pmtiles"),
         _GEOPACKAGE.when("file", "*.gpkg", "*.pmtiles"),
     ),
-    "map view": (_ARROW, _MATPLOTLIB.when("out", "*.png")),
+    "map view": (_ARROW, _SHAPELY, _MATPLOTLIB.when("out", "*.png")),
     "study robustness": (_MATPLOTLIB,),
     "study bandwidth": (_MATPLOTLIB,),
     "study shared-bandwidth": (_MATPLOTLIB,),
