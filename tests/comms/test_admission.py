@@ -271,6 +271,15 @@ def test_without_arrival_times_a_stamp_in_the_future_is_not_given() -> None:
     assert len(inbox.messages(NOW)) == 1
 
 
+@pytest.mark.parametrize(
+    ("age_ns", "given"), [(-LIMITS.max_skew_ns, 1), (LIMITS.max_age_ns, 1), (LIMITS.max_age_ns + 1, 0)]
+)
+def test_a_message_is_given_up_to_its_maximum_age(age_ns: int, given: int) -> None:
+    inbox = filled(with_objects(), arrival_ns=None)
+    assert len(inbox.messages(NOW + age_ns)) == given
+    assert len(inbox.messages()) == given
+
+
 def drive(inbox: Inbox, agents: range, start: int, stop: int, skew_ns: int = 0) -> None:
     """Messages of agents every 100 ms."""
     for k in range(start, stop):
@@ -308,6 +317,8 @@ def test_the_first_senders_keep_their_places_and_the_last_give_way_in_order() ->
     assert [m.agent_id for m in inbox.messages()] == [0, 1, 2, 6]
     inbox = filled([empty(agent) for agent in range(12)], limits=replace(LIMITS, max_senders=8))
     assert [m.agent_id for m in inbox.messages()] == [0, 1, 2, 3, 4, 5, 10, 11]
+    inbox = filled([empty(agent) for agent in range(6)], limits=replace(LIMITS, max_senders=3))
+    assert [m.agent_id for m in inbox.messages()] == [0, 1, 5]
 
 
 @pytest.mark.parametrize("order", [(1, 2, 3), (3, 1, 2), (2, 3, 1)])
