@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from manyeyes.agents import map_perception
 from manyeyes.agents.agent import Agent
-from manyeyes.agents.map_features import decode_map_features, encode_map_features
+from manyeyes.agents.map_features import decode_map_features, encode_map_features, predict_tile
 from manyeyes.agents.map_perception import (
     MAP_MODES,
     MapModelPredictor,
@@ -75,6 +76,49 @@ def test_received_features_widen_the_view_and_change_the_prediction(mapper):
         wrong = replace(received, tokens=tokens.with_features(features))
         other = MapModelPredictor(mapper, ALL)(both, [wrong])
         assert other is not None and np.array_equal(other.elements.points, own.elements.points)
+
+
+def hostile_features(received, what):
+    pose, tokens = received.world_from_agent, received.tokens
+    zero = torch.zeros((), dtype=torch.float64)
+    if what == "upside down":
+        turned = Transform.from_rpy(torch.zeros(3).double(), zero + math.pi, zero, zero)
+        return replace(received, agent_id=66, world_from_agent=pose @ turned)
+    if what == "1e6 m above":
+        return replace(received, agent_id=66, world_from_agent=Transform(pose.rotation, pose.translation + 1e6))
+    value = {"3e38": 3e38, "not a number": math.nan}[what]
+    return replace(received, agent_id=66, tokens=tokens.with_features(torch.full_like(tokens.features, value)))
+
+
+@pytest.mark.parametrize(
+    "what, reason", [("3e38", "value"), ("not a number", "value"), ("upside down", "pose"), ("1e6 m above", "pose")]
+)
+def test_a_hostile_map_sender_leaves_the_honest_elements_and_is_named(mapper, what, reason):
+    received = decode_map_features(encode_map_features(mapper, frame(2, x=8.0, yaw=math.pi)), mapper)
+    predictor = MapModelPredictor(mapper, ALL)
+    clean = predictor.predict(frame(1), [received])
+    struck = predictor.predict(frame(1), [hostile_features(received, what), received])
+    assert clean.local_map is not None and struck.local_map is not None and len(clean.local_map.elements)
+    assert np.array_equal(clean.local_map.elements.points, struck.local_map.elements.points)
+    assert np.array_equal(clean.local_map.view, struck.local_map.view)
+    assert not clean.rejected and [(r.agent_id, r.reason) for r in struck.rejected] == [(66, reason)]
+
+
+def test_a_map_sender_that_makes_the_prediction_fail_is_named(mapper, monkeypatch):
+    received = decode_map_features(encode_map_features(mapper, frame(2, x=8.0, yaw=math.pi)), mapper)
+
+    def fail(model, messages, world_from_tile):
+        if any(message.agent_id == 66 for message in messages):
+            raise RuntimeError("an unexpected shape")
+        return predict_tile(model, messages, world_from_tile)
+
+    monkeypatch.setattr(map_perception, "predict_tile", fail)
+    predictor = MapModelPredictor(mapper, ALL)
+    clean = predictor.predict(frame(1), [received])
+    struck = predictor.predict(frame(1), [received, replace(received, agent_id=66)])
+    assert clean.local_map is not None and struck.local_map is not None
+    assert np.array_equal(clean.local_map.elements.points, struck.local_map.elements.points)
+    assert [(r.agent_id, r.reason) for r in struck.rejected] == [(66, "content_error")]
 
 
 def test_an_empty_cloud_gives_no_map(mapper):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from manyeyes.agents import map_server
 from manyeyes.agents.map_perception import encode_map_message
 from manyeyes.agents.map_server import FIRST_REBUILD_COUNT, MIN_SIGMA_M, MapServer, make_observation
 from manyeyes.comms.inbox import Inbox
@@ -15,7 +16,7 @@ from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapEleme
 from manyeyes.datatypes.message import LocalMap
 from manyeyes.maps.elements.observation import MapFrame, ObservationError
 from manyeyes.maps.fusion.fuse import fuse
-from manyeyes.maps.fusion.incremental import compute_map_fscore
+from manyeyes.maps.fusion.incremental import IncrementalMap, compute_map_fscore
 
 WINDOW = np.array([[-30.0, -15.0], [30.0, -15.0], [30.0, 15.0], [-30.0, 15.0]])
 CROSSING_RING = np.array([[20.0, -5.0], [24.0, -5.0], [24.0, 5.0], [20.0, 5.0]])
@@ -184,6 +185,38 @@ def test_a_hostile_map_is_refused_with_its_reason_and_the_others_are_fused(hosti
     assert len(made.observations) == 10
     assert made.rebuild().quantised_hash() == rest.rebuild().quantised_hash()
     assert made.map().quantised_hash() == rest.map().quantised_hash()
+
+
+def test_an_observation_that_makes_the_update_fail_is_its_senders_rejection(monkeypatch):
+    """It raised, and the observation stayed among the accepted ones."""
+    update = IncrementalMap.update
+
+    def fail(self, observation):
+        if observation.agent == "66":
+            update(self, observation)
+            raise np.linalg.LinAlgError("singular matrix")
+        return update(self, observation)
+
+    clean, struck = service(), service()
+    messages = [received_of(encode_map_message(frame(k, x), street(x))) for k, x in ((1, 30.0), (2, 50.0))]
+    for message in messages:
+        clean.ingest(message)
+    monkeypatch.setattr(IncrementalMap, "update", fail)
+    struck.ingest(messages[0])
+    assert struck.ingest(received_of(encode_map_message(frame(66, 40.0), street(40.0)))) == []
+    struck.ingest(messages[1])
+    assert [(r.agent, r.reason) for r in struck.rejected] == [("66", "LinAlgError: singular matrix")]
+    assert [one.agent for one in struck.observations] == ["1", "2"]
+    assert np.array_equal(clean.map().elements.points, struck.map().elements.points)
+
+
+def test_rejected_and_incomplete_messages_are_bounded_in_number(monkeypatch):
+    monkeypatch.setattr(map_server, "MAX_REMEMBERED", 3)
+    made, first = service(), received_of(encode_map_message(frame(1, 30.0), street(30.0)))[0]
+    for stamp in range(9):
+        message = replace(first.message, timestamp_ns=stamp)
+        made.ingest_message(replace(first, message=message, expected_packets=first.received_packets + 1))
+    assert made.num_incomplete == 3
 
 
 def test_a_message_without_a_map_is_no_observation():
