@@ -15,7 +15,7 @@ import os
 import stat
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -64,10 +64,10 @@ def unpack_zip_member(archive: zipfile.ZipFile, name: str, max_bytes: int, path:
         raise OSError(errno.EIO, f"damaged zip member {name} ({error})", str(path)) from error
 
 
-def parse_json(text: str | bytes) -> Any:
-    """Parse JSON; ValueError where it is none, deeply nested JSON included."""
+def parse_json(text: str | bytes, make_object: Callable[[list[tuple[str, Any]]], Any] | None = None) -> Any:
+    """Parse JSON; ValueError where it is none, deeply nested JSON included. make_object: as ``object_pairs_hook`` of ``json``."""
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=make_object)
     except RecursionError:
         raise ValueError("nested too deeply") from None
 

@@ -98,12 +98,28 @@ def test_invalid_samples_are_rejected_and_the_rest_is_read(tmp_path, poses, bad,
     assert "layout" in aside[0].reason
 
 
+def test_a_sample_that_is_there_twice_counts_once_and_huge_numbers_are_rejected(tmp_path, poses):
+    vectors = [vector([[0, 0], [10**400, 0]], "divider", 0.9)]
+    samples = [
+        {"sample_token": "a", "vectors": []},
+        {"sample_token": "a", "vectors": []},
+        {"sample_token": "b", "vectors": vectors},
+    ]
+    loaded = read_model_results(write(tmp_path / "r.json", {"results": samples}), poses, RESULT_OPTIONS["maptr-av2"])
+    assert len(loaded.observations) == 1
+    assert [r.row for r in loaded.rejected] == [1, 2]
+    assert "is there twice" in loaded.rejected[0].reason and "finite numbers" in loaded.rejected[1].reason
+
+
 def test_sample_without_elements_is_empty_observation(tmp_path, poses):
     path = write(tmp_path / "r.json", {"results": [{"sample_token": "a", "vectors": []}]})
     assert len(read_model_results(path, poses, RESULT_OPTIONS["maptr-av2"]).observations[0].elements) == 0
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"results": 3}'])
+@pytest.mark.parametrize(
+    "text",
+    ["{", "[]", '{"results": 3}', "[" * 100_000, '{"results": {"a": 1, "a": 2}}', '{"results": [], "results": []}'],
+)
 def test_a_file_of_another_kind_is_refused(tmp_path, poses, text):
     (tmp_path / "x.json").write_text(text)
     with pytest.raises(ModelResultsError, match=r"x\.json"):
@@ -117,6 +133,7 @@ def test_a_file_of_another_kind_is_refused(tmp_path, poses, text):
         ("token,agent,pass_id,time_ns,x,y,yaw\na,b,c,1,2,north,0\n", "line 2"),
         ("token,agent,pass_id,time_ns,x,y,yaw,sigma_x\na,b,c,1,2,3,0,-1\n", "above 0"),
         ("token,agent,pass_id,time_ns,x,y,yaw\na,b,c,1,inf,3,0\n", "finite"),
+        ("token,agent,pass_id,time_ns,x,y,yaw\na,b,c,1,2,3,0\na,b,c,2,2,3,0\n", "line 3: token 'a' is in line 2 too"),
     ],
 )
 def test_a_table_of_poses_that_cannot_be_read_is_named(tmp_path, text, reason):
@@ -178,6 +195,16 @@ def test_nuscenes_poses_are_of_the_frame_that_the_results_are_in(nuscenes, tmp_p
     path = write(tmp_path / "r.json", ahead)
     (observation,) = read_model_results(path, lidar, RESULT_OPTIONS["maptr-nuscenes"]).observations
     np.testing.assert_allclose(observation.elements_in_map().points, [[100, 205.9], [100, 209.9]], atol=1e-9)
+
+
+@pytest.mark.parametrize("rotation", ["north", [1, 0, 0], [1, 0, 0, "x"], [10**400, 0, 0, 10**400]])
+def test_a_nuscenes_pose_without_numbers_is_named(nuscenes, rotation):
+    rows = json.loads((nuscenes / "ego_pose.json").read_text())
+    for row in rows:
+        row["rotation"] = rotation
+    write(nuscenes / "ego_pose.json", rows)
+    with pytest.raises(ModelResultsError, match="a pose and a time in numbers"):
+        read_nuscenes_poses(nuscenes, "boston-seaport")
 
 
 def test_nuscenes_tables_that_do_not_fit_are_named(nuscenes):

@@ -6,8 +6,10 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -252,3 +254,58 @@ def test_the_frame_asked_for_is_the_frame_required(tmp_path: Path) -> None:
     write_observations(tmp_path / "a.parquet", crowd(1), FRAME)
     reading = read_observations(tmp_path, MapFrame(48.0, 8.4))
     assert reading.observations == () and "latitude 48.0" in reading.rejected[0].reason
+
+
+FAR_ORIGIN = {"crs": "EPSG:4326", "latitude": 10**400, "longitude": 0}
+
+
+def metadata_text(text: str) -> dict[bytes, str]:
+    return {METADATA_KEY: text}
+
+
+def repeated_text(table: Any, name: str) -> Any:
+    """Return 3,000 rows whose text of a million letters is stored once."""
+    column = pa.DictionaryArray.from_arrays(pa.array(np.zeros(3000, np.int8)), pa.array(["a" * 1_000_000]))
+    many = table.take([0] * 3000)
+    return many.set_column(many.column_names.index(name), name, column)
+
+
+def not_unicode(table: Any) -> Any:
+    offsets = pa.py_buffer(np.arange(len(table) + 1, dtype=np.int32).tobytes())
+    column = pa.Array.from_buffers(pa.string(), len(table), [None, offsets, pa.py_buffer(b"\xff" * len(table))])
+    return table.set_column(0, "agent", column)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.replace_schema_metadata(metadata_text("[" * 100_000)), "expected metadata 'manyeyes'.*RecursionError"),
+        (lambda t: t.replace_schema_metadata(stated({"origin": FAR_ORIGIN})), "OverflowError"),
+        (lambda t: t.replace_schema_metadata(stated({"crs": "x" * 1_000_000})), "crs: expected"),
+        (lambda t: t.replace_schema_metadata(stated({"version": 10**300})), "of version 1"),
+        (lambda t: t.append_column("agent", t["agent"]), "agent more than once"),
+        (not_unicode, "rows 0 to 1 cannot be decoded: 'utf-8'"),
+        (lambda t: repeated_text(t, "agent"), "column agent: expected at most 268435456 bytes of text; got 3000000000"),
+        (lambda t: repeated_text(t, "model"), "column model: expected at most 268435456 bytes of text"),
+    ],
+    ids=["nested", "latitude", "crs", "version", "twice", "utf-8", "agents", "models"],
+)  # fmt: skip
+def test_absurd_files_are_put_aside_with_a_short_reason(tmp_path: Path, change: Callable, message: str) -> None:
+    many = crowd(4)
+    write_observations(tmp_path / "a.parquet", many[:2], FRAME)
+    bad = change(observation_table(many[2:], FRAME))
+    pq.write_table(bad, tmp_path / "b.parquet", row_group_size=10_000)
+    reading = read_observations(tmp_path)
+    assert [o.id for o in reading.observations] == [o.id for o in many[:2]]
+    (aside,) = reading.rejected
+    assert aside.file.endswith("b.parquet") and re.search(message, aside.reason) and len(aside.reason) < 800
+
+
+def test_a_group_of_rows_that_expands_without_bound_is_put_aside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_observations(tmp_path / "a.parquet", crowd(4), FRAME)
+    monkeypatch.setattr("manyeyes.maps.elements.observation_file._MAX_GROUP_VALUES", 10)
+    reading = read_observations(tmp_path)
+    (aside,) = reading.rejected
+    assert reading.observations == () and aside.count == 4 and "expected at most 10 values a column" in aside.reason

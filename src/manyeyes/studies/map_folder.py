@@ -93,7 +93,9 @@ def report_rejected(rejected: Sequence[RejectedRows], console: Console) -> None:
     for rows in rejected:
         location = f"{rows.file} row {rows.row}" if rows.row >= 0 else rows.file
         count_note = f" ({rows.count} rows)" if rows.count > 1 else ""
-        console.print(f"rejected: {location}{count_note}: {rows.reason}", highlight=False, markup=False, soft_wrap=True)
+        # Texts of a file may hold line ends and control sequences of terminals.
+        text = "".join(c if c.isprintable() else "?" for c in f"rejected: {location}{count_note}: {rows.reason}")
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 def write_vector_map(vector_map: VectorMap, folder: Path) -> None:

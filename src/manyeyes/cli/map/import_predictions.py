@@ -61,6 +61,12 @@ def main(options: Options) -> None:
         )
     if options.poses is not None and options.origin is None:
         raise ConfigError("--poses needs --origin LATITUDE LONGITUDE, degrees: where x = y = 0 lies on the earth.")
+    for name in ("range_x", "range_y"):
+        low, high = getattr(options, name)
+        if low >= high:
+            raise ConfigError(
+                f"--{name.replace('_', '-')} needs a smaller number, then a larger one; got {low:g} {high:g}."
+            )
     console = Console()
     if options.poses is not None and options.origin is not None:
         poses = read_pose_csv(options.poses, MapFrame(*options.origin))

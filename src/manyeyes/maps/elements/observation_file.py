@@ -37,7 +37,8 @@ CRS = "local transverse Mercator, WGS 84, scale 1"
 ROW_GROUP_SIZE = 1024
 # What a group of rows may hold once it is decoded; compressed, far more fits into a small file. A group of ROW_GROUP_SIZE
 # observations of 25 elements of 20 points has half a million values in its longest column.
-_MAX_GROUP_VALUES, _MAX_GROUP_BYTES = 20_000_000, 2**30
+_MAX_GROUP_VALUES, _MAX_GROUP_BYTES, _MAX_TEXT_BYTES = 20_000_000, 2**30, 2**28
+_TEXTS = ("agent", "pass_id", "model", "id")
 # Origins closer than a tenth of a millimetre are one.
 _SAME_DEGREES = 1e-9
 _UPPER = np.triu_indices(3)
@@ -228,7 +229,9 @@ def _open(file: Path, expected: MapFrame | None) -> Any:
         raise ObservationError(
             f"{file}: expected the columns of docs/maps/observation.md; {wrong}. Write the file again."
         )
-    return opened
+    paths = [opened.metadata.schema.column(k).path for k in range(opened.metadata.num_columns)]
+    texts = [path for path in paths if path in _TEXTS or (path.startswith("elements.") and path.endswith(".kind"))]
+    return pq.ParquetFile(file, metadata=opened.metadata, read_dictionary=texts, page_checksum_verification=True)
 
 
 def _is_same(one: MapFrame, other: MapFrame) -> bool:
@@ -244,9 +247,11 @@ def _iterate_file_rows(opened: Any) -> Iterator[tuple[int, Observation | tuple[i
         count = opened.metadata.row_group(group).num_rows
         try:
             _check_size(opened.metadata.row_group(group))
-            for row, item in iterate_observations(opened.read_row_group(group)):
+            table = opened.read_row_group(group)
+            _check_texts(table)
+            for row, item in iterate_observations(table):
                 yield start + row, (1, item) if isinstance(item, str) else item
-        except (pa.ArrowException, OSError, ObservationError) as error:
+        except (pa.ArrowException, OSError, ObservationError, UnicodeDecodeError) as error:
             yield start, (count, f"rows {start} to {start + count - 1} cannot be decoded: {_line(error)}")
         start += count
 
@@ -259,6 +264,25 @@ def _check_size(group: Any) -> None:
             f"expected at most {_MAX_GROUP_VALUES} values a column and {_MAX_GROUP_BYTES} bytes; got {values} and "
             f"{group.total_byte_size}. Write smaller groups of rows."
         )
+
+
+def _check_texts(table: pa.Table) -> None:
+    """Raise ObservationError for texts that are stored once and take too much memory when each row has its own."""
+    pa = _pyarrow()
+    import pyarrow.compute as pc
+
+    columns = [(name, chunk) for name in _TEXTS if name in table.column_names for chunk in table.column(name).chunks]
+    elements = [pc.list_flatten(chunk) for chunk in table.column("elements").chunks if pa.types.is_list(chunk.type)]
+    columns += [("kind", pc.struct_field(one, "kind")) for one in elements if pa.types.is_struct(one.type)]
+    for name, column in columns:
+        if not pa.types.is_dictionary(column.type) or not pa.types.is_string(column.type.value_type):
+            continue
+        lengths = pc.binary_length(column.dictionary).fill_null(0).to_numpy(zero_copy_only=False)
+        counts = np.bincount(column.indices.drop_null().to_numpy(zero_copy_only=False), minlength=len(lengths))
+        if (size := int(counts @ lengths)) > _MAX_TEXT_BYTES:
+            raise ObservationError(
+                f"column {name}: expected at most {_MAX_TEXT_BYTES} bytes of text; got {size}. Shorten the texts."
+            )
 
 
 def _read_frame(file: Path, stored: dict[bytes, bytes]) -> MapFrame:

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from manyeyes._io import parse_json, read_file
 from manyeyes.datatypes import ManyeyesError
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, STOP_LINE, MapElements
-from manyeyes.maps.elements.observation import MapFrame, Observation, ObservationError
+from manyeyes.maps.elements.observation import MapFrame, Observation, ObservationError, shorten
 from manyeyes.maps.elements.observation_file import LoadedObservations, RejectedRows
 
 Array = NDArray[np.float64]
@@ -111,19 +111,23 @@ RESULT_OPTIONS = {
 def read_model_results(source: Path | str, poses: PoseTable, options: ModelResultOptions) -> LoadedObservations:
     """Return the samples of a result file of MapTR or StreamMapNet (distinguished by their layout) as observations, by token."""
     path = Path(source)
-    root = _json(path)
+    root = _json(path, _unique)
     results = root.get("results") if isinstance(root, dict) else None
     if not isinstance(results, list | dict):
         raise ModelResultsError(
             f"{path}: expected an object with 'results', a list (MapTR) or an object (StreamMapNet)."
         )
     pose_of_token = dict(zip(poses.tokens, poses.poses))
-    kept, rejected = [], []
+    kept, rejected, read = [], [], set[str]()
     for row, (token, vectors) in enumerate(_samples(results)):
+        context = f"{path}: sample '{shorten(token)}'"
         try:
             if token not in pose_of_token:
-                raise ModelResultsError(f"{path}: sample '{token}' has no pose; add it to the table of poses.")
-            kept.append(_observation(pose_of_token[token], vectors, options, f"{path}: sample '{token}'"))
+                raise ModelResultsError(f"{context} has no pose; add it to the table of poses.")
+            if token in read:
+                raise ModelResultsError(f"{context} is there twice; the first one counts. Leave one out.")
+            read.add(token)
+            kept.append(_observation(pose_of_token[token], vectors, options, context))
         except (ModelResultsError, ObservationError) as error:
             rejected.append(RejectedRows(str(path), row, 1, str(error)))
     return LoadedObservations(poses.frame, tuple(kept), tuple(rejected))
@@ -204,14 +208,14 @@ def _kind(name: Any) -> int | None:
 def _score(value: Any, context: str) -> float:
     if isinstance(value, int | float) and 0.0 <= value <= 1.0:
         return float(value)
-    raise ModelResultsError(f"{context}: expected a score in [0, 1]; got {value!r}.")
+    raise ModelResultsError(f"{context}: expected a score in [0, 1]; got {shorten(repr(value))}.")
 
 
 def _points(value: Any, context: str) -> Array:
     """Return (M, 2) points; a third coordinate is left out."""
     try:
         points = np.asarray(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         points = np.zeros(0)
     if points.ndim != 2 or points.shape[-1] not in (2, 3) or not np.isfinite(points).all():
         raise ModelResultsError(f"{context}: expected a list of points [x, y] of finite numbers; got another value.")
@@ -235,8 +239,14 @@ def read_pose_csv(source: Path | str, frame: MapFrame) -> PoseTable:
         raise ModelResultsError(
             f"{path}: expected the columns {', '.join(_COLUMNS)}; {', '.join(missing)} missing or no row."
         )
-    poses = []
+    poses, tokens = [], dict[str, int]()
     for number, row in enumerate(rows, start=2):
+        if row["token"] in tokens:
+            first = tokens[row["token"]]
+            raise ModelResultsError(
+                f"{path} line {number}: token '{shorten(row['token'])}' is in line {first} too; leave one out."
+            )
+        tokens[row["token"]] = number
         sigma = [row.get(f"sigma_{axis}") or default for axis, default in zip(("x", "y", "yaw"), _POSE_SIGMA)]
         try:
             x, y, yaw, *spread = (float(v) for v in (row["x"], row["y"], row["yaw"], *sigma))
@@ -248,7 +258,7 @@ def read_pose_csv(source: Path | str, frame: MapFrame) -> PoseTable:
         if not np.isfinite([x, y, yaw]).all() or min(spread) <= 0:
             raise ModelResultsError(f"{path} line {number}: expected finite numbers and sigmas above 0.")
         poses.append(SamplePose(row["agent"], row["pass_id"], time, (x, y, yaw), (spread[0], spread[1], spread[2])))
-    return PoseTable(frame, tuple(row["token"] for row in rows), tuple(poses))
+    return PoseTable(frame, tuple(tokens), tuple(poses))
 
 
 def read_nuscenes_poses(folder: Path | str, location: str, axes: Literal["vehicle", "lidar"] = "vehicle") -> PoseTable:
@@ -273,24 +283,31 @@ def read_nuscenes_poses(folder: Path | str, location: str, axes: Literal["vehicl
             scene = scenes[samples[row["sample_token"]]["scene_token"]]
             log = logs[scene["log_token"]]
             ego, mount = poses[row["ego_pose_token"]], mounts[row["calibrated_sensor_token"]]
-        except KeyError as error:
+        except (KeyError, TypeError) as error:
             raise ModelResultsError(
-                f"{root}: sample {row['sample_token']} names {error}, which no table holds."
+                f"{root}: sample {shorten(row['sample_token'])} names {shorten(error)}, which no table holds."
             ) from None
         if log["location"] == location:
-            x, y, yaw = _planar(ego)
-            if axes == "lidar":
-                # The LiDAR's y axis is what a result file calls forward.
-                dx, dy, turn = _planar(mount)
-                x, y = x + math.cos(yaw) * dx - math.sin(yaw) * dy, y + math.sin(yaw) * dx + math.cos(yaw) * dy
-                yaw += turn + math.pi / 2
+            try:
+                pose = _planar(ego) if axes == "vehicle" else _lidar_pose(_planar(ego), _planar(mount))
+                found.append(SamplePose(str(log["vehicle"]), str(scene["name"]), int(row["timestamp"]) * 1000, pose))
+            except (TypeError, ValueError, IndexError, OverflowError) as error:
+                raise ModelResultsError(
+                    f"{root}: sample {shorten(row['sample_token'])}: expected a pose and a time in numbers; {shorten(error)}."
+                ) from None
             tokens.append(row["sample_token"])
-            found.append(SamplePose(log["vehicle"], scene["name"], int(row["timestamp"]) * 1000, (x, y, yaw)))
     if not tokens:
         raise ModelResultsError(
             f"{root}: no LiDAR key frame at '{location}'; give the folder with the tables of the data set."
         )
     return PoseTable(MapFrame(*_NUSCENES_ORIGIN[location]), tuple(tokens), tuple(found))
+
+
+def _lidar_pose(ego: tuple[float, float, float], mount: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Return the LiDAR's x, y and the yaw of its y axis, which a result file calls forward."""
+    (x, y, yaw), (dx, dy, turn) = ego, mount
+    c, s = math.cos(yaw), math.sin(yaw)
+    return x + c * dx - s * dy, y + s * dx + c * dy, yaw + (turn + math.pi / 2)
 
 
 def _planar(row: dict[str, Any]) -> tuple[float, float, float]:
@@ -309,11 +326,22 @@ def _table(root: Path, name: str, *fields: str) -> Sequence[dict[str, Any]]:
     return rows
 
 
-def _json(path: Path) -> Any:
+def _json(path: Path, make_object: Callable[[list[tuple[str, Any]]], Any] | None = None) -> Any:
+    """Read a JSON file; make_object: of the pairs of an object, a dictionary without it."""
     try:
-        return parse_json(read_file(path, _MAX_FILE_BYTES))
+        return parse_json(read_file(path, _MAX_FILE_BYTES), make_object)
     except (OSError, ValueError) as error:
         raise ModelResultsError(f"{path}: expected a JSON file; {error}.") from error
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Make a dictionary; ValueError where a key is there twice."""
+    made = dict(pairs)
+    if len(made) < len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"'{shorten(twice)}' is there twice in one object, leave one out")
+    return made
 
 
 __all__ = [
