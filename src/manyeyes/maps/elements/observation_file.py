@@ -269,15 +269,16 @@ def _check_size(group: Any) -> None:
 def _check_texts(table: pa.Table) -> None:
     """Raise ObservationError for texts that are stored once and take too much memory when each row has its own."""
     pa = _pyarrow()
-    import pyarrow.compute as pc
-
     columns = [(name, chunk) for name in _TEXTS if name in table.column_names for chunk in table.column(name).chunks]
-    elements = [pc.list_flatten(chunk) for chunk in table.column("elements").chunks if pa.types.is_list(chunk.type)]
-    columns += [("kind", pc.struct_field(one, "kind")) for one in elements if pa.types.is_struct(one.type)]
+    elements = [chunk.flatten() for chunk in table.column("elements").chunks if pa.types.is_list(chunk.type)]
+    columns += [("kind", one.field("kind")) for one in elements if pa.types.is_struct(one.type) and "kind" in one.type]
     for name, column in columns:
         if not pa.types.is_dictionary(column.type) or not pa.types.is_string(column.type.value_type):
             continue
-        lengths = pc.binary_length(column.dictionary).fill_null(0).to_numpy(zero_copy_only=False)
+        texts = column.dictionary
+        if not len(texts):
+            continue
+        lengths = np.diff(np.frombuffer(texts.buffers()[1], np.int32, len(texts) + 1, 4 * texts.offset))
         counts = np.bincount(column.indices.drop_null().to_numpy(zero_copy_only=False), minlength=len(lengths))
         if (size := int(counts @ lengths)) > _MAX_TEXT_BYTES:
             raise ObservationError(
