@@ -103,7 +103,7 @@ def test_many_files_are_flushed_once_and_each_folder_once(tmp_path: Path, events
     assert events == [*flushes, ("name", "whole"), ("flush", tmp_path.name)]
 
 
-@pytest.mark.parametrize("save", [save_weights, save_text])
+@pytest.mark.parametrize("save", [save_weights, save_result, save_manifest, save_cell, save_text])
 def test_a_full_disk_is_an_error_with_the_name_of_the_file_and_leaves_the_old_one(save, tmp_path: Path) -> None:
     name = save(tmp_path)
     before = (tmp_path / name).read_bytes()
