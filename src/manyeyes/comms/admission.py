@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from manyeyes.comms import payloads
 from manyeyes.comms.drop_counts import DropReason
 from manyeyes.comms.entropy import CodeTables
 from manyeyes.comms.map_payload import UNIT_M, ElementRows
@@ -93,6 +94,8 @@ class Admission:
         """Numbers that the reader of the body would allocate for."""
         if envelope.header.num_packets > self._limits.max_message_packets:
             return "message_size"
+        if envelope.kind != payloads.TOKENS:
+            return None
         return "cells" if envelope.claimed_cells > self._limits.max_cells else None
 
     def _check_fingerprint(self, fragment: Fragment) -> DropReason | None:

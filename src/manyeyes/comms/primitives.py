@@ -294,11 +294,36 @@ def _are_finite(raw: U8x1, at: int, size: int) -> bool:  # pragma: no cover
     return not bad
 
 
-def max_magnitudes(data: bytes, size: int, columns: int) -> NDArray[np.float32]:
-    """Return the largest magnitude of each column of rows of little-endian floats of size bytes, 2 or 4, none of them NaN."""
-    # Without their signs, the bits of floats are in the order of their values.
-    bits = np.frombuffer(data, f"<u{size}").reshape(-1, columns) & np.array((1 << 8 * size - 1) - 1, f"<u{size}")
-    return bits.max(0).view(f"<f{size}").astype(np.float32)
+@njit(cache=True)
+def are_floats_within(raw: U8x1, size: int, bounds: I64x1) -> bool:  # pragma: no cover
+    """Return whether rows of little-endian floats of size bytes, 2 or 4, none of them NaN, are within the bounds of their columns.
+
+    bounds: (C,) the bits of the bounds. Without their signs, the bits of floats are in the order of their values.
+    """
+    columns, column, top, num_beyond = bounds.shape[0], 0, size - 1, 0
+    for at in range(0, raw.shape[0], size):
+        bits = np.int64(raw[at + top] & 0x7F)
+        for k in range(top - 1, -1, -1):
+            bits = bits << 8 | np.int64(raw[at + k])
+        num_beyond += bits > bounds[column]
+        column += 1
+        if column == columns:
+            column = 0
+    return num_beyond == 0
+
+
+@njit(cache=True)
+def are_steps_within(raw: U8x1, codes: U8x1, bounds: I64x1) -> bool:  # pragma: no cover
+    """Return the same of rows of int8; codes: (C,) scales of the columns; bounds: (256, C), flat, the largest step by scale."""
+    columns, column, num_beyond = codes.shape[0], 0, 0
+    for at in range(raw.shape[0]):
+        step = np.int64(raw[at])
+        step = 256 - step if step > 127 else step
+        num_beyond += step > bounds[codes[column] * columns + column]
+        column += 1
+        if column == columns:
+            column = 0
+    return num_beyond == 0
 
 
 def _scales() -> NDArray[np.float32]:

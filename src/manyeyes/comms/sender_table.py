@@ -149,15 +149,16 @@ class SenderTable:
         if sender is None or held is None:
             new = Sender(instant_start_ns=arrival_ns, instant_packets=1, instant_bytes=size)
             return self._begin_message(sender or new, fragment, amount, arrival_ns)
-        if not self._has_memory(sender, sender.memory + amount.memory):
+        memory = held.memory if len(sender.messages) == 1 else sender.memory
+        if not self._has_memory(sender, memory + amount.memory):
             return "full"
         held.assembly.add(fragment)
         held.packet_bytes += size
         held.memory += amount.memory
         if amount.content is not None:
             held.counts[amount.content] = held.counts.get(amount.content, 0) + amount.number
-        if arrival_ns is not None:
-            held.last_arrival_ns = max(arrival_ns, held.last_arrival_ns or arrival_ns)
+        if arrival_ns is not None and (held.last_arrival_ns is None or arrival_ns > held.last_arrival_ns):
+            held.last_arrival_ns = arrival_ns
         self._record_arrival(sender, arrival_ns)
         return None
 
@@ -203,8 +204,8 @@ class SenderTable:
     def _record_arrival(self, sender: Sender, arrival_ns: int | None) -> None:
         self._num_packets += 1
         sender.last_packet = self._num_packets
-        if arrival_ns is not None:
-            sender.last_arrival_ns = max(arrival_ns, sender.last_arrival_ns or arrival_ns)
+        if arrival_ns is not None and (sender.last_arrival_ns is None or arrival_ns > sender.last_arrival_ns):
+            sender.last_arrival_ns = arrival_ns
 
     def _has_memory(self, sender: Sender, memory: int) -> bool:
         """Return whether the messages of a sender may take this much memory."""

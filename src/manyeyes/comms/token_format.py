@@ -17,7 +17,7 @@ from torch import Tensor
 
 from manyeyes.comms import primitives
 from manyeyes.comms.entropy import CodeTables
-from manyeyes.comms.payloads import TokenRows
+from manyeyes.comms.payloads import TokenEncoding, TokenRows
 from manyeyes.datatypes import BevGrid, SparseBev
 
 TokenRefusal = Literal["wrong_model", "grid", "width", "value"]
@@ -47,11 +47,13 @@ class TokenFormat:
     tables: CodeTables | None = None
     peaks: tuple[float, ...] | None = None
     max_values: NDArray[np.float32] = field(init=False, repr=False)
+    _bounds: dict[TokenEncoding, NDArray[np.int64]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         peaks = [MAX_TOKEN_VALUE] * self.channels if self.peaks is None else self.peaks
         bounds = np.minimum(PEAK_FACTOR * np.maximum(peaks, MIN_PEAK), MAX_TOKEN_VALUE)
         object.__setattr__(self, "max_values", bounds.astype(np.float32))
+        object.__setattr__(self, "_bounds", _integer_bounds(bounds * _ROUNDING))
 
     def check_packet(self, fingerprint: bytes, rows: TokenRows) -> TokenRefusal | None:
         """Why the tokens of one packet are not of this form; None where they are."""
@@ -63,8 +65,15 @@ class TokenFormat:
             return None if self.tables is not None and rows.channels == self.tables.width else "width"
         if rows.channels != self.channels:
             return "width"
-        within = not len(rows.key) or bool((max_magnitudes(rows) <= self.max_values * _ROUNDING).all())
-        return None if within else "value"
+        return None if self._is_within_range(rows) else "value"
+
+    def _is_within_range(self, rows: TokenRows) -> bool:
+        values = np.frombuffer(rows.values, np.uint8)
+        if rows.encoding == "int8":
+            codes = np.frombuffer(rows.scales, np.uint8)
+            return bool(primitives.are_steps_within(values, codes, self._bounds["int8"]))
+        size = 4 if rows.encoding == "float32" else 2
+        return bool(primitives.are_floats_within(values, size, self._bounds[rows.encoding]))
 
     def check_tokens(self, tokens: SparseBev) -> TokenRefusal | None:
         """Return the same of tokens that were read already, rows of floats (N, channels)."""
@@ -82,12 +91,11 @@ class TokenFormat:
         return features.clamp(-bound, bound)
 
 
-def max_magnitudes(rows: TokenRows) -> NDArray[np.float32]:
-    """Return the largest magnitude of each channel of the float values of a packet, which has cells."""
-    if rows.encoding == "int8":
-        scale = primitives.dequantise_int8(
-            np.frombuffer(rows.scales, np.uint8), np.full((1, rows.channels), 127, np.int8)
-        )
-        steps = np.frombuffer(rows.values, np.int8).reshape(-1, rows.channels)
-        return np.abs(steps.astype(np.int16)).max(0) / np.float32(127) * scale[0]
-    return primitives.max_magnitudes(rows.values, 4 if rows.encoding == "float32" else 2, rows.channels)
+def _integer_bounds(bounds: NDArray[np.float64]) -> dict[TokenEncoding, NDArray[np.int64]]:
+    """Return bounds (C,) as the bits of floats, and as the largest int8 step by scale code and channel, flat."""
+    scales = np.maximum(primitives.SCALES[:, None].astype(np.float64), 1e-9)
+    return {
+        "float32": bounds.astype(np.float32).view(np.uint32).astype(np.int64),
+        "float16": bounds.astype(np.float16).view(np.uint16).astype(np.int64),
+        "int8": np.minimum(np.floor(127 * bounds / scales), 128).astype(np.int64).ravel(),
+    }

@@ -148,8 +148,7 @@ class EncodedBody(NamedTuple):
     content: bytes
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Fragment:
+class Fragment(NamedTuple):
     """One packet, read and checked. body is None where the message has no section."""
 
     header: MessageHeader
