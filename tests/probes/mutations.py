@@ -138,10 +138,11 @@ class _Finder(ast.NodeVisitor):
         self.visit(node.value)
 
     def visit_Return(self, node: ast.Return) -> None:
-        if node.value is None or (isinstance(node.value, ast.Constant) and node.value.value is None):
-            return
-        self.add(node.value, "return None", "None")
-        self.visit(node.value)
+        # None for False is the same condition.
+        if node.value is not None and ast.unparse(node.value) not in ("None", "False"):
+            self.add(node.value, "return None", "None")
+        if node.value is not None:
+            self.visit(node.value)
 
     def visit_condition(self, node: ast.If | ast.While | ast.IfExp) -> None:
         if ast.unparse(node.test) in ("TYPE_CHECKING", "__name__ == '__main__'"):

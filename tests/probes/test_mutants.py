@@ -88,9 +88,10 @@ def test_every_mutation_changes_the_program_and_compiles(tool) -> None:
     assert len(mutants) > 5 and original not in mutants
 
 
-def test_numbers_of_drawings_and_signs_of_axes_stay(tool) -> None:
+def test_what_would_change_nothing_is_not_mutated(tool) -> None:
     assert tool.find_mutations("src/manyeyes/viz/a.py", b"x = 3\ny = 2.5\n") == []
     assert changed_lines(tool, b"x = sum(-1)\n") == {"x = sum(-1)": {"x = sum(-0)"}}
+    assert changed_lines(tool, b"def f(): return False\n") == {"def f(): return False": {"def f(): return True"}}
     assert changed_lines(tool, b"x = sum(0)\n") == {"x = sum(0)": {"x = sum(1)"}}
 
 
