@@ -1,6 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 import hashlib
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -108,3 +113,26 @@ def test_misuse_is_named(tmp_path: Path) -> None:
         record(JOBS, tmp_path, workers=0)
     with pytest.raises(ConfigError, match="one name"):
         record([JOBS[0], JOBS[0]], tmp_path)
+
+
+_POOL = """
+import multiprocessing, os, time
+from concurrent.futures import ProcessPoolExecutor
+from manyeyes.simulator.record import _start_worker
+with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _start_worker) as pool:
+    print(pool.submit(os.getpid).result(), flush=True)
+    pool.submit(time.sleep, 100).result()
+"""
+
+
+def test_a_worker_ends_when_its_run_is_killed() -> None:
+    with subprocess.Popen([sys.executable, "-c", _POOL], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        worker = int(process.stdout.readline())
+        process.kill()
+    for _ in range(300):
+        if not Path(f"/proc/{worker}").exists():
+            return
+        time.sleep(0.1)
+    os.kill(worker, signal.SIGKILL)
+    raise AssertionError("it lives on")
