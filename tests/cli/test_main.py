@@ -133,3 +133,39 @@ def test_doctor_names_damaged_weights_and_exits_with_1(monkeypatch, capsys, tmp_
     assert "No such file" in statuses["feakm-small"]["problem"]
     assert output.err.startswith(f"manyeyes: {folder}") and output.err.count("\n") == 1
     assert "pip install --force-reinstall manyeyes" in output.err
+
+
+def test_an_argument_that_could_not_be_decoded_is_one_line(capsys) -> None:
+    assert cli.main(["view", "/tmp/\udcc3\udcbc"]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1 and "PYTHONUTF8=1" in err and "\\udcc3" in err
+
+
+def test_letters_that_the_output_lacks_are_escaped(monkeypatch) -> None:
+    import io
+    import sys
+
+    from manyeyes.cli import doctor
+
+    output = io.TextIOWrapper(io.BytesIO(), "ascii")
+    monkeypatch.setattr(sys, "stdout", output)
+    monkeypatch.setattr(doctor, "main", lambda options: print("1\N{DEGREE SIGN}"))
+    assert cli.main(["doctor"]) == 0
+    output.flush()
+    assert output.buffer.getvalue() == b"1\\xb0\n"  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_a_lack_of_memory_and_a_path_that_cannot_be_encoded_are_one_line(monkeypatch, capsys) -> None:
+    from manyeyes.cli import doctor
+
+    def encode(options: object) -> None:
+        "a\udcc3".encode()
+
+    def fill(options: object) -> None:
+        raise MemoryError
+
+    for run, expected in ((encode, "PYTHONUTF8=1"), (fill, "not enough memory")):
+        monkeypatch.setattr(doctor, "main", run)
+        assert cli.main(["doctor"]) == 1
+        err = capsys.readouterr().err
+        assert err.count("\n") == 1 and expected in err

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+import io
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
@@ -43,6 +44,7 @@ COMMAND_GROUPS = {
 MODULES = {"fit-codebook": "fit_codebook", "map import": "map import_predictions"}
 """Modules of commands whose name differs from the command."""
 INTERRUPTED_EXIT_CODE = 130
+_ENCODING_REMEDY = f"{sys.getfilesystemencoding()} of this environment: set PYTHONUTF8=1, or rename the file."
 
 
 def make_help_text(group: str = "") -> str:
@@ -69,6 +71,9 @@ def make_help_text(group: str = "") -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; the exit code is 0, 1 for a designed error, 2 for wrong arguments, 130 after Ctrl-C."""
     argument_list = list(sys.argv[1:] if arguments is None else arguments)
+    _escape_output()
+    if undecoded := next((word for word in argument_list if not _is_text(word)), None):
+        return _fail(f"the argument {undecoded!a} is no text in the encoding {_ENCODING_REMEDY}", 2)
     if not argument_list or argument_list[0] in ("-h", "--help", "help"):
         sys.stdout.write(make_help_text())
         return 0
@@ -145,9 +150,25 @@ def _run_command(command: str, arguments: Sequence[str]) -> int:
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         return _fail(f"{where}{error.strerror or error}", 1)
+    except UnicodeEncodeError as error:
+        return _fail(f"{error.object[:200]!a} cannot be written in the encoding {_ENCODING_REMEDY}", 1)
+    except MemoryError:
+        return _fail("not enough memory; use fewer --workers, smaller inputs or a machine with more.", 1)
     except KeyboardInterrupt:
         return _fail("stopped.", INTERRUPTED_EXIT_CODE)
     return 0
+
+
+def _is_text(word: str) -> bool:
+    """Return whether a word of the command line could be decoded: libraries take paths as UTF-8 only."""
+    return not any("\ud800" <= letter <= "\udfff" for letter in word)
+
+
+def _escape_output() -> None:
+    """Print letters that the encoding of the output lacks as escapes instead of failing."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _fail(text: str, code: int) -> int:

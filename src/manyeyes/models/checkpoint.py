@@ -9,7 +9,8 @@ import json
 import math
 import types
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,6 +18,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as serialize
 from torch import nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from manyeyes._bounds import Bounds
 from manyeyes._io import atomic_write, parse_json
@@ -153,9 +155,8 @@ def load_as(path: Path, format: str, kind: type[Config], build: Callable[[Config
     state, metadata = _read(path, format)
     try:
         config = config_from_json(kind, metadata["config"])
-        with torch.device("meta"):  # shapes alone: memory is taken only for what the file holds
-            _check_tensors(path, state, _tensors(build(config)))
-        model = build(config)
+        with _limit_parameters(sum(value.numel() for value in state.values())):
+            model = build(config)
     except json.JSONDecodeError as error:
         raise CheckpointError(f"{path}: its configuration is not JSON ({error}); copy or train it again.") from error
     except (ConfigError, *_BUILD_ERRORS) as error:
@@ -164,13 +165,32 @@ def load_as(path: Path, format: str, kind: type[Config], build: Callable[[Config
             f"{path}: its configuration is not one of this version of manyeyes: {reason[:600]} "
             "Use the version that wrote it, install the package that registers what is missing, or train again."
         ) from error
+    _check_tensors(path, state, _tensors(model))
     model.load_state_dict({k: v.float() for k, v in state.items()}, strict=False)
     model.eval().requires_grad_(False)
     return model
 
 
+@contextmanager
+def _limit_parameters(num_stored: int) -> Iterator[None]:
+    """Raise ConfigError as soon as the modules built in the block have more than twice as many parameters as a file holds."""
+    num_built = 0
+
+    def count(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
+        nonlocal num_built
+        num_built += 0 if parameter is None else parameter.numel()
+        if num_built > 2 * num_stored + 1000:
+            raise ConfigError(f"it describes a larger model than the {num_stored:,} numbers of the file.")
+
+    handle = register_module_parameter_registration_hook(count)  # pyright: ignore[reportArgumentType]
+    try:
+        yield
+    finally:
+        handle.remove()
+
+
 def _check_tensors(path: Path, state: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) -> None:
-    """Compare names, shapes and values of a file's tensors with those of a model, which may be without memory."""
+    """Compare names, shapes and values of a file's tensors with those of a model."""
     for name in sorted(set(expected) | set(state)):
         if name not in state or name not in expected or state[name].shape != expected[name].shape:
             here = tuple(state[name].shape) if name in state else "nothing"

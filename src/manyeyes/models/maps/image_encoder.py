@@ -51,6 +51,8 @@ class ImageEncoderConfig:
             raise ConfigError(
                 f"ImageEncoderConfig.blocks needs two or more stages of a block or more; got {self.blocks}."
             )
+        if len(self.blocks) > 8 or self.stem_channels << (len(self.blocks) - 1) > 4096:
+            raise ConfigError(f"ImageEncoderConfig has at most 8 stages and 4096 channels in the last; got {self}.")
         if self.stride not in (4, 8):
             raise ConfigError(f"ImageEncoderConfig.stride is 4 or 8; got {self.stride}.")
 
