@@ -28,7 +28,7 @@ from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
 
-MAX_SECONDS = 10
+MAX_SECONDS = 30
 HUGE = 2**70
 
 NO_COMMAND = """
