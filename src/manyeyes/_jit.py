@@ -55,6 +55,9 @@ class _LockedIndexFile(caching.IndexDataCacheFile):
 
 caching.IndexDataCacheFile = _LockedIndexFile
 
+Int64 = int | np.int64
+"""Integer of a compiled loop."""
+
 # Arrays of compiled loops: element type and number of dimensions.
 Boolx1 = np.ndarray[tuple[int], np.dtype[np.bool_]]
 Boolx2 = np.ndarray[tuple[int, int], np.dtype[np.bool_]]

@@ -314,6 +314,22 @@ def test_a_sender_without_common_objects_is_propagated_from_its_last_pose() -> N
         PoseCorrection(sigma_speed_mps=0.0)
 
 
+def test_the_state_of_a_sender_that_left_expires() -> None:
+    world, strange = cars(10, 12), cars(10, 11)
+    messages = [message_of(world, OTHERS[0], sigma=0.2), message_of(strange, OTHERS[1], agent_id=3, sigma=0.2)]
+    states = PoseCorrection().correct(frame(), cache_of(world), messages, {}).states
+    assert [(a, len(s.monitor.time_s), s.last_corrected is None) for a, s in states.items()] == [
+        (2, 1, False),
+        (3, 0, True),
+    ]
+
+    def state_after(seconds: float) -> list[tuple[int, bool]]:
+        left = PoseCorrection().correct(frame(round(seconds * 1e9)), cache_of(world), [], states).states
+        return [(a, s.last_corrected is None) for a, s in left.items()]
+
+    assert [state_after(s) for s in (1.4, 1.6, 59.0, 61.0)] == [[(2, False)], [(2, True)], [(2, True)], []]
+
+
 def test_no_messages_and_unknown_correctors() -> None:
     found = PoseCorrection().correct(frame(), cache_of(cars(5, 0)), [], {})
     assert (found.messages, found.corrections, dict(found.states)) == ((), (), {})

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from manyeyes.comms.channel import CHANNELS, Channel, ChannelPreset, Transmission, channel_preset
+from manyeyes.comms.channel import CHANNELS, Channel, ChannelPreset, SharedMedium, Transmission, channel_preset
 from manyeyes.comms.local_bus import LocalBus
 from manyeyes.datatypes import ConfigError
 
@@ -231,3 +231,11 @@ def test_misuse_is_named():
 def test_impossible_presets_are_refused(change):
     with pytest.raises(ConfigError, match="ChannelPreset"):
         replace(SLOW, **change)
+
+
+def test_agents_that_left_are_forgotten():
+    medium = SharedMedium(channel_preset("ideal"))
+    for number in range(100):
+        medium.offer(Transmission(number, HERE, packets(1), number * MS))
+        assert len(medium.run((number + 0.5) * MS)) == 1
+    assert len(medium._numbered) <= 1

@@ -19,11 +19,10 @@ MIN_RESTORED_SCORE = 0.3
 
 def restore_own_boxes(fused: Boxes, own: Boxes, min_score: float = MIN_RESTORED_SCORE) -> Boxes:
     """Return the fused boxes, and each own box of min_score without a fused box nearby, at a reduced score; by falling score."""
-    confident = own[own.score >= min_score]
-    distance = torch.cdist(confident.center[:, :2].double(), fused.center[:, :2].double())
-    displaced = confident[~(distance <= SAME_OBJECT_DISTANCE_M).any(1)]
-    if not len(displaced):
+    distance = torch.cdist(own.center[:, :2].double(), fused.center[:, :2].double())
+    displaced = (own.score >= min_score) & ~(distance <= SAME_OBJECT_DISTANCE_M).any(1)
+    if not displaced.any():
         return fused
-    restored = replace(displaced, score=displaced.score * DISPLACED_SCORE_FACTOR).to(fused.center.dtype)
+    restored = replace(own, score=own.score * DISPLACED_SCORE_FACTOR)[displaced].to(fused.center.dtype)
     found = Boxes.cat([fused, restored])
     return found[found.score.argsort(descending=True, stable=True)]

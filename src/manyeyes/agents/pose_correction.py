@@ -42,6 +42,8 @@ Floats = NDArray[np.float64]
 
 MAX_SILENCE_S = 60.0
 """The monitor of a sender restarts after a longer gap."""
+MAX_MESSAGE_AGE_S = 1.0
+"""Maximum age of a received message, and of the message before whose pose is propagated to it, beyond propagate_s."""
 MAX_SENDER_STATES = 256
 """Number of senders whose state is kept, the last received ones."""
 _FAULTY = (PoseHealth.OFFSET, PoseHealth.DRIFTING)
@@ -91,6 +93,15 @@ class SenderState:
     monitor: PoseMonitorState
     last_corrected: Message | None = None
 
+    def drop_expired(self, now_s: float, max_message_age_s: float) -> SenderState | None:
+        """Return the state without a monitor silent for MAX_SILENCE_S or an older message; None if neither is left."""
+        time_s, last = self.monitor.time_s, self.last_corrected
+        is_silent = not len(time_s) or abs(now_s - time_s[-1]) > MAX_SILENCE_S
+        is_old = last is None or abs(now_s - last.timestamp_ns * 1e-9) > max_message_age_s
+        if is_silent and is_old:
+            return None
+        return SenderState(PoseMonitorState.new() if is_silent else self.monitor, None if is_old else last)
+
 
 @dataclass(frozen=True)
 class CorrectedMessages:
@@ -138,11 +149,8 @@ class PoseCorrection:
         A message with infinite pose covariance has no prior: it is used only if its pose is measured from objects.
         """
         now_s = frame.timestamp_ns * 1e-9
-        new_states = {
-            a: s
-            for a, s in states.items()
-            if not len(s.monitor.time_s) or abs(now_s - s.monitor.time_s[-1]) <= MAX_SILENCE_S
-        }
+        current = {a: s.drop_expired(now_s, self.propagate_s + MAX_MESSAGE_AGE_S) for a, s in states.items()}
+        new_states = {a: s for a, s in current.items() if s is not None}
         if not messages:
             return CorrectedMessages((), (), new_states)
         own = self.extract_own_landmarks(frame, cache)

@@ -190,7 +190,10 @@ class SharedMedium:
         self._last_served = -(1 << 63)
 
     def offer(self, transmission: Transmission) -> None:
-        """Hand packets to the medium; they begin no earlier than sent_ns. An agent's offers come in order of time."""
+        """Hand packets to the medium; they begin no earlier than sent_ns. An agent's offers come in order of time.
+
+        No offer is earlier than the end of the last run.
+        """
         stamp, number = self._numbered.get(transmission.agent_id, (transmission.sent_ns, 0))
         number = number if stamp == transmission.sent_ns else 0
         self._numbered[transmission.agent_id] = (transmission.sent_ns, number + len(transmission.packets))
@@ -213,6 +216,8 @@ class SharedMedium:
                 self._enqueue(*self._offered.pop(0))
             if self._waiting:
                 out.append(self._serve(start))
+        # Later offers are not earlier than until_ns: agents that left are forgotten.
+        self._numbered = {agent: offered for agent, offered in self._numbered.items() if offered[0] >= until_ns}
         return out
 
     def _enqueue(self, transmission: Transmission, first_number: int) -> None:

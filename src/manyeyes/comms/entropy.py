@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import Boolx1, I32x2, I64x1, I64x2, U8x1, U8x2, njit
+from manyeyes._jit import Boolx1, I32x2, I64x1, I64x2, Int64, U8x1, U8x2, njit
 from manyeyes.comms.primitives import PacketError
 from manyeyes.datatypes import ConfigError
 
@@ -251,7 +251,7 @@ def _write(symbols: I32x2, out: U8x1) -> int:  # pragma: no cover
 
 
 @njit(cache=True)
-def _take(state: int, frequency: int, offset: int, raw: U8x1, at: int) -> tuple[int, int]:  # pragma: no cover
+def _take(state: Int64, frequency: int, offset: Int64, raw: U8x1, at: int) -> tuple[Int64, int]:  # pragma: no cover
     """State and place after a symbol; offset: how far the state lies above the symbol's start. Bytes beyond the end are 0."""
     state = frequency * (state >> TOTAL_BITS) + offset
     while state < _MIN_STATE and at <= raw.shape[0]:

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import I64x1, U8x1, njit
+from manyeyes._jit import I64x1, Int64, U8x1, njit
 from manyeyes.datatypes import WireError
 
 Reason = Literal["garbage", "version", "checksum", "implausible", "contradiction", "wrong_model"]
@@ -128,7 +128,7 @@ def _sizes(key: I64x1) -> tuple[int, int]:  # pragma: no cover
 
 
 @njit(cache=True)
-def _varint_bytes(value: int) -> int:  # pragma: no cover
+def _varint_bytes(value: Int64) -> int:  # pragma: no cover
     size = 1
     while value >> 7:
         value >>= 7

@@ -324,7 +324,7 @@ def cast_pinhole_reference(
     v, u = np.mgrid[0:height, 0:width] + 0.5
     ray = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(intrinsic).T @ rotation.T
     depth, owner = np.full((height, width), np.inf), np.full((height, width), NOTHING, np.int32)
-    for i in np.flatnonzero(~_own(primitives, own)):
+    for i in map(int, np.flatnonzero(~_own(primitives, own))):
         o, d = primitives.rotation[i].T @ (origin - primitives.center[i]), ray @ primitives.rotation[i]
         t, leave, _ = reference_hit(int(primitives.kind[i]), o, d, primitives.half[i])
         if primitives.density[i] > 0:

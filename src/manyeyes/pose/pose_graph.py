@@ -209,7 +209,7 @@ def _information(pose: Floats, covariance: Floats) -> Floats:
     """Inverse covariance of a small motion on the right of the measured pose; an exact prior has a sigma of 0.1 mm."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    return np.linalg.inv(turn @ covariance @ turn.T + 1e-8 * np.eye(3))
+    return np.asarray(np.linalg.inv(turn @ covariance @ turn.T + 1e-8 * np.eye(3)), np.float64)
 
 
 def _initial_poses(

@@ -79,7 +79,7 @@ def _shift_line(line: Floats, point_pairs: Floats) -> list[Floats]:
     """Return the seen parts of a line, at 1 m, across it at the mean of the claimed points (K, 4): true x, y, claimed x, y."""
     stations = resample_lines(make_lines([line]), MatchingProtocol("stations", spacing_m=1.0)).points
     step = np.gradient(stations, axis=0)
-    normal = np.stack((-step[:, 1], step[:, 0]), 1) / np.maximum(np.hypot(*step.T), 1e-9)[:, None]
+    normal = np.stack((-step[:, 1], step[:, 0]), 1) / np.maximum(np.hypot(step[:, 0], step[:, 1]), 1e-9)[:, None]
     nearest = np.hypot(
         point_pairs[:, None, 0] - stations[None, :, 0], point_pairs[:, None, 1] - stations[None, :, 1]
     ).argmin(1)
