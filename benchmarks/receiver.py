@@ -39,6 +39,7 @@ from tests.probes.hostile import ATTACKS, attack_packets  # noqa: E402
 from tests.probes.memory import release_memory, resident_kb  # noqa: E402
 
 from manyeyes import Agent, AgentFrame  # noqa: E402
+from manyeyes.agents.own_detections import MIN_RESTORED_SCORE  # noqa: E402
 from manyeyes.agents.strategies.registry import get_strategy  # noqa: E402
 from manyeyes.models import pretrained  # noqa: E402
 from manyeyes.studies.provenance import write_json  # noqa: E402
@@ -178,7 +179,8 @@ def difference(strategy: str, step: str, spent: np.ndarray, equal: int) -> Diffe
 class Attack:
     """One hostile sender beside three honest ones: ratio of the time of perceive, and MiB at the peak with and without it.
 
-    share_kept: of the boxes of the honest drive, those within 1 m of a box under attack, the least over the instants.
+    share_kept: of the boxes of the honest drive of score 0.3 or more, those within 1 m of a box under attack, the least over the
+    instants.
     """
 
     strategy: str
@@ -211,8 +213,9 @@ def measure_attack(name: str, strategy: str, seen: Sequence[AgentFrame], instant
             row += [time.process_time() - began, (resident_kb("VmHWM") - before) / 1024]
         if instant:
             rows.append(row)
-            if len(found[0]):
-                nearest = torch.cdist(found[0].center[:, :2], found[1].center[:, :2]).amin(1)
+            detected = found[0][found[0].score >= MIN_RESTORED_SCORE]
+            if len(detected):
+                nearest = torch.cdist(detected.center[:, :2], found[1].center[:, :2]).amin(1)
                 kept.append(float((nearest <= 1.0).float().mean()))
     median = np.median(np.array(rows), 0)
     peaks = np.array(rows).max(0)

@@ -106,8 +106,9 @@ class Agent:
         self.pose_correction = pose_correction
         self._sender_states: Mapping[int, SenderState] = {}
         self._accepted_poses: AcceptedPoses = {}
-        self._quarantine, self.limits = Quarantine(), ReceiverLimits()
         self.strategy = strategy or IntermediateFusion()
+        self._quarantine = Quarantine()
+        self.limits = ReceiverLimits() if self.strategy.uses_points else ReceiverLimits(max_points=0)
         if self.strategy.needs_tokens:
             require_tokens(detector)
         self.token_encoding: TokenEncoding = token_encoding or default_token_encoding(detector)

@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import torch
 
-from manyeyes.agents.strategies.message_header import ego_from_sender
 from manyeyes.comms.bandwidth import allocate_max_min_fair
 from manyeyes.comms.inbox import ReceivedMessage, Rejection
 from manyeyes.comms.receiver_limits import ReceiverLimits
@@ -48,8 +48,9 @@ def _is_empty(message: Message) -> bool:
 
 
 def _distance_m(frame: AgentFrame, reception: ReceivedMessage) -> float:
-    distance = float(ego_from_sender(frame, reception.message).translation.norm())
-    return distance if distance == distance else float("inf")
+    here, there = frame.world_from_agent.translation, reception.message.world_from_agent.translation
+    distance = math.dist(here.tolist(), there.tolist())
+    return distance if distance == distance else math.inf
 
 
 def _keep_tokens(reception: ReceivedMessage, count: int) -> ReceivedMessage:

@@ -10,10 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import mul
 
 import torch
 
-from manyeyes.agents.strategies.message_header import ego_from_sender
 from manyeyes.comms.receiver_limits import ReceiverLimits
 from manyeyes.datatypes import AgentFrame, Message
 
@@ -52,10 +52,13 @@ def find_pose_fault(
     frame: AgentFrame, message: Message, last: AcceptedPose | None, limits: ReceiverLimits
 ) -> str | None:
     """Return why the stated pose of a message is implausible for the receiver of a frame, or None if it is plausible."""
-    relative = ego_from_sender(frame, message)
-    x, y, height = relative.translation.tolist()
+    ego, sender = frame.world_from_agent, message.world_from_agent
+    offset = [there - here for there, here in zip(sender.translation.tolist(), ego.translation.tolist())]
+    # The columns of a rotation are the axes of the agent in the world.
+    x, y, height = (sum(map(mul, axis, offset)) for axis in zip(*ego.rotation.tolist()))
     distance = math.hypot(x, y)
-    tilt = math.acos(max(-1.0, min(1.0, float(relative.rotation[2, 2]))))
+    cosine = sum(ego_row[2] * row[2] for ego_row, row in zip(ego.rotation.tolist(), sender.rotation.tolist()))
+    tilt = math.acos(max(-1.0, min(1.0, cosine)))
     sigma_xy, variance_yaw = _sigma_xy_m(message), float(message.pose_covariance[2, 2])
     # A comparison with NaN is false, so each check states what is plausible.
     if not distance <= limits.max_distance_m:
@@ -89,10 +92,10 @@ def with_unknown_pose(message: Message) -> Message:
 
 def has_known_pose(agent: AgentFrame | Message) -> bool:
     """Return whether the pose covariance of an agent is finite."""
-    return bool(agent.pose_covariance.isfinite().all())
+    return all(math.isfinite(value) for row in agent.pose_covariance.tolist() for value in row)
 
 
 def _sigma_xy_m(message: Message) -> float:
     """Return the larger standard deviation of x and y; infinite for an unknown pose."""
-    variance = float(message.pose_covariance.diagonal()[:2].max())
-    return math.sqrt(max(variance, 0.0)) if variance < math.inf else math.inf
+    (xx, _, _), (_, yy, _), _ = message.pose_covariance.tolist()
+    return math.sqrt(max(xx, yy, 0.0)) if xx < math.inf and yy < math.inf else math.inf

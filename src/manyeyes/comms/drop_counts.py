@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Literal
 
 from manyeyes.comms.primitives import Reason
@@ -37,6 +37,10 @@ class DropCounts:
     unauthenticated: int = 0
     # Too many packets or bytes of this sender within instant_ns
     rate: int = 0
+    # Without any section, while the sender's last message has content
+    empty: int = 0
+    # Of an earlier message of its sender, or of a smaller one of the same instant
+    superseded: int = 0
     # Tokens of other weights; with the receiver's fingerprint, but another grid, width, or beyond its range of values
     wrong_model: int = 0
     grid: int = 0
@@ -48,10 +52,6 @@ class DropCounts:
     points: int = 0
     map_elements: int = 0
     range: int = 0
-    # Without any section, while the sender's last message has content
-    empty: int = 0
-    # Of an earlier message of its sender, or of a smaller one of the same instant
-    superseded: int = 0
     # More packets or bytes in one message than the bounds allow
     message_size: int = 0
     # A copy; or inconsistent with another packet of the same message
@@ -64,7 +64,3 @@ class DropCounts:
     def total(self) -> int:
         """Packets not taken, for whatever reason."""
         return sum(getattr(self, f.name) for f in fields(self))
-
-    def increment(self, reason: DropReason) -> DropCounts:
-        """Return one more packet of that reason."""
-        return replace(self, **{reason: getattr(self, reason) + 1})

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -94,13 +95,13 @@ class Inbox:
         self._tables = tables if token_format is None else token_format.tables
         self._admission = Admission(self.limits, fingerprint, token_format, authenticate)
         self._senders = SenderTable(self.limits)
-        self._dropped = DropCounts()
+        self._dropped = Counter[DropReason]()
         self._rejections: dict[int, Rejection] = {}
 
     @property
     def dropped(self) -> DropCounts:
         """Packets not taken so far, by reason."""
-        return self._dropped
+        return DropCounts(**self._dropped)
 
     def push(self, packet: bytes, arrival_ns: int | None = None) -> None:
         """Take one packet; whatever is wrong with it is counted and never raised."""
@@ -109,7 +110,7 @@ class Inbox:
         except PacketError as error:
             refusal = error.reason
         if refusal is not None:
-            self._dropped = self._dropped.increment(refusal)
+            self._dropped[refusal] += 1
 
     def received_messages(self, now_ns: int | None = None) -> tuple[ReceivedMessage, ...]:
         """Return the newest message of each agent, as far as it came, by agent id; those out of date at now_ns are dropped."""
@@ -145,6 +146,9 @@ class Inbox:
         agent_id = envelope.header.agent_id
         if self._senders.exceeds_rate(agent_id, len(envelope.packet), arrival_ns):
             return "rate"
+        refusal = self._senders.check_stamp(envelope)
+        if refusal is not None:
+            return refusal
         fragment = self._admission.read(envelope, self._tables)
         if isinstance(fragment, str):
             if fragment in _TOKEN_TEXTS:

@@ -13,7 +13,8 @@ from manyeyes.datatypes import ConfigError
 class ReceiverLimits:
     """Bounds of received packets, of messages, and of poses. Honest senders stay below all of them.
 
-    A cloud of points (early fusion) is the longest message: lower max_message_bytes where none is expected.
+    A cloud of points (early fusion) is the longest message: lower max_message_bytes where none is expected; max_points of 0 refuses
+    clouds.
     """
 
     # Packets and messages
@@ -57,5 +58,5 @@ class ReceiverLimits:
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            if not value > 0:
+            if not (value > 0 or (f.name == "max_points" and value == 0)):
                 raise ConfigError(f"ReceiverLimits.{f.name} is a number above 0; got {value!r}.")

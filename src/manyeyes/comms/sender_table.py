@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 from manyeyes.comms.drop_counts import ContentRefusal, DropReason
 from manyeyes.comms.map_payload import ElementRows
-from manyeyes.comms.payloads import ObjectRows, PointRows, TokenRows
+from manyeyes.comms.payloads import NONE, ObjectRows, PointRows, TokenRows
 from manyeyes.comms.receiver_limits import ReceiverLimits
-from manyeyes.comms.wire import Assembly, Fragment, count_bitmap_bytes
+from manyeyes.comms.wire import Assembly, Envelope, Fragment, count_bitmap_bytes
 from manyeyes.datatypes.message import RequestMap
 
 REGULAR_MESSAGES = 3
@@ -132,6 +132,26 @@ class SenderTable:
             if not sender.messages and self._is_silent(sender, now_ns):
                 del self._senders[agent_id]
 
+    def check_stamp(self, envelope: Envelope) -> DropReason | None:
+        """Return why the stamp of a packet excludes the message that it begins; the body is not needed."""
+        sender, stamp = self._senders.get(envelope.header.agent_id), envelope.header.timestamp_ns
+        if sender is None or not sender.messages or any(m.timestamp_ns == stamp for m in sender.messages):
+            return None
+        newest = max(message.timestamp_ns for message in sender.messages)
+        if stamp <= newest - self._limits.min_stamp_spacing_ns:
+            return "superseded"
+        is_recent = stamp - newest <= self._limits.max_age_ns
+        if envelope.kind == NONE and is_recent and any(m.assembly.has_content for m in sender.messages):
+            return "empty"
+        same_instant = self._same_instant(sender, stamp)
+        shortest = min((message.packet_bytes for message in same_instant), default=0)
+        return "superseded" if len(same_instant) > 1 and len(envelope.packet) <= shortest else None
+
+    def _same_instant(self, sender: Sender, stamp: int) -> list[HeldMessage]:
+        """Return the messages of a sender that a new one does not supersede."""
+        newest = max((message.timestamp_ns for message in sender.messages), default=stamp)
+        return [m for m in sender.messages if m.timestamp_ns > max(stamp, newest) - self._limits.min_stamp_spacing_ns]
+
     def store(self, fragment: Fragment, arrival_ns: int | None) -> DropReason | None:
         """Put a packet with its message; the reason where there is no place for it. A contradiction is a PacketError."""
         agent_id, stamp = fragment.header.agent_id, fragment.header.timestamp_ns
@@ -175,20 +195,10 @@ class SenderTable:
     def _begin_message(
         self, sender: Sender, fragment: Fragment, amount: _Amount, arrival_ns: int | None
     ) -> DropReason | None:
-        """Begin a message of a sender with its first packet; the reason where a held message, or a bound, excludes it."""
-        stamp, spacing_ns, size = fragment.header.timestamp_ns, self._limits.min_stamp_spacing_ns, len(fragment.packet)
-        newest = max((message.timestamp_ns for message in sender.messages), default=stamp)
-        if stamp <= newest - spacing_ns:
-            return "superseded"
-        is_recent = stamp - newest <= self._limits.max_age_ns
-        if fragment.body is None and is_recent and any(m.assembly.has_content for m in sender.messages):
-            return "empty"
-        same_instant = [m for m in sender.messages if m.timestamp_ns > max(stamp, newest) - spacing_ns]
+        """Begin a message of a sender with its first packet, which passed check_stamp; the reason where a bound excludes it."""
+        same_instant, size = self._same_instant(sender, fragment.header.timestamp_ns), len(fragment.packet)
         if len(same_instant) > 1:
-            shortest = min(same_instant, key=lambda message: message.packet_bytes)
-            if size <= shortest.packet_bytes:
-                return "superseded"
-            same_instant.remove(shortest)
+            same_instant.remove(min(same_instant, key=lambda message: message.packet_bytes))
         if not self._has_memory(sender, sum(m.memory for m in same_instant) + amount.memory):
             return "full"
         if fragment.header.agent_id not in self._senders and not self._make_place(arrival_ns):

@@ -121,6 +121,9 @@ _POSITION_UNITS = 1 << 20
 _POSITION_BYTES = 6
 _MAX_POSITION_M = 1e8
 _SIGMA_M, _SIGMA_RAD = (1e-3, 1e4), (1e-5, 10.0)
+_CODES = np.arange(256, dtype=np.uint8)
+_SIGMAS_M: list[float] = log_values(_CODES, *_SIGMA_M).tolist()
+_SIGMAS_RAD: list[float] = log_values(_CODES, *_SIGMA_RAD).tolist()
 _EMPTY_BITMAP = np.zeros(0, np.uint8)
 _SENDING_ORDER = (payloads.OBJECTS, payloads.REQUEST, payloads.TOKENS, payloads.ELEMENTS, payloads.POINTS)
 
@@ -320,13 +323,17 @@ def _encode_covariance(covariance: NDArray[np.float64]) -> list[int]:
 
 def _decode_covariance(covariance_codes: tuple[int, ...]) -> NDArray[np.float64]:
     """Return the inverse of _encode_covariance; any codes are some covariance."""
-    codes = np.array(covariance_codes[:3], np.uint8)
-    sigma = np.concatenate((log_values(codes[:2], *_SIGMA_M), log_values(codes[2:], *_SIGMA_RAD))).astype(np.float64)
-    lower = np.zeros((3, 3))
-    lower[[1, 2, 2], [0, 0, 1]] = np.array(covariance_codes[3:]) / 127
-    lower /= np.maximum(np.linalg.norm(lower, axis=1, keepdims=True), 1)
-    lower[range(3), range(3)] = np.sqrt(np.maximum(1 - np.square(lower).sum(1), 0))
-    factor = sigma[:, None] * lower
+    x, y, yaw, *correlations = covariance_codes
+    a, b, c = (code / 127 for code in correlations)
+    second, third = max(abs(a), 1.0), max(math.sqrt(b * b + c * c), 1.0)
+    a, b, c = a / second, b / third, c / third
+    sigma = (_SIGMAS_M[x], _SIGMAS_M[y], _SIGMAS_RAD[yaw])
+    lower = (
+        (1.0, 0.0, 0.0),
+        (a, math.sqrt(max(1 - a * a, 0.0)), 0.0),
+        (b, c, math.sqrt(max(1 - (b * b + c * c), 0.0))),
+    )
+    factor = np.array([[s * value for value in row] for s, row in zip(sigma, lower)])
     return factor @ factor.T
 
 

@@ -47,6 +47,7 @@ class IntermediateFusion(FusionStrategy):
     score: Callable[[PerceptionCache, AgentFrame], Tensor] = novelty_score
     uses_history: bool = True
     needs_tokens: bool = True
+    uses_points = False
 
     def compose_message(
         self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()

@@ -32,6 +32,7 @@ class LateFusion(FusionStrategy):
     min_score: float = 0.05
     max_boxes: int = 128
     uses_history: bool = False
+    uses_points = False
 
     def compose_message(
         self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()

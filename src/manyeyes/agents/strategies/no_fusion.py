@@ -14,6 +14,8 @@ from manyeyes.datatypes import AgentFrame, Boxes, Message
 class NoFusion(FusionStrategy):
     """Single-agent perception without messages."""
 
+    uses_points = False
+
     def compose_message(
         self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()
     ) -> Message | None:

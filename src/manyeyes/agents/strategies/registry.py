@@ -17,10 +17,12 @@ class FusionStrategy(Protocol):
     Attributes:
         uses_history: older messages of each sender are fused too, also of senders without a current message.
         needs_tokens: it needs a TokenDetector.
+        uses_points: it fuses the clouds of messages; packets of clouds are refused otherwise, since their decoding takes time.
     """
 
     uses_history: bool = False
     needs_tokens: bool = False
+    uses_points: bool = True
 
     def compose_message(
         self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()
