@@ -312,6 +312,19 @@ def test_the_number_of_fused_senders_and_tokens_is_bounded(drive, detector, scen
     assert [r.reason for r in perception.rejected] == ["busy"] * 4
 
 
+@pytest.mark.parametrize("strategy", ["late", "intermediate"])
+def test_later_senders_displace_none_that_was_fused_before(drive, detector, scene_of, strategy) -> None:
+    """Also after the later ones were fused in places that were free for an instant."""
+    scene, ego = scene_of(strategy, drive), Agent(detector, get_strategy(strategy))
+    ego.limits = replace(ego.limits, max_fused_senders=4)
+    for n, (frame, sent) in enumerate(zip(scene.frames, scene.packets)):
+        nearest = [restated(sent[0], 100 + k, world_from_agent=frame.world_from_agent) for k in range(9)]
+        present = (sent, sent[:1], sent)[n]
+        perception = ego.perceive(frame, [p for packets in (*(nearest if n else ()), *present) for p in packets])
+        fused = {r.message.agent_id for r in perception.received}
+        assert len(fused) == (3 if n == 0 else 4) and fused >= ({1} if n == 1 else {1, 2, 3})
+
+
 def test_tokens_of_a_message_with_too_many_are_excluded(drive, detector, scene_of) -> None:
     """The whole section: a message that names every cell left less than half of the honest boxes."""
     scene = scene_of("intermediate", drive)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from manyeyes.agents.fusion_selection import select_for_fusion
+from manyeyes.agents.fusion_selection import KnownSenders, first_fusion_ns, select_for_fusion, update_known_senders
 from manyeyes.agents.isolation import Quarantine, content_error, isolate_failing
 from manyeyes.agents.message_history import MessageHistory
 from manyeyes.agents.own_detections import restore_own_boxes
@@ -106,6 +106,7 @@ class Agent:
         self.pose_correction = pose_correction
         self._sender_states: Mapping[int, SenderState] = {}
         self._accepted_poses: AcceptedPoses = {}
+        self._known_senders: KnownSenders = {}
         self.strategy = strategy or IntermediateFusion()
         self._quarantine = Quarantine()
         self.limits = ReceiverLimits() if self.strategy.uses_points else ReceiverLimits(max_points=0)
@@ -195,6 +196,7 @@ class Agent:
         for rejection in failed:
             inbox.discard(rejection.agent_id)
         fused = {reception.message.agent_id for reception in perception.received}
+        self._known_senders = update_known_senders(self._known_senders, fused, frame.timestamp_ns)
         # The pose of a fused sender was estimated.
         rejected = [
             rejection for rejection in rejected if rejection.reason != "pose" or rejection.agent_id not in fused
@@ -230,7 +232,7 @@ class Agent:
 
     def _perceive(self, frame: AgentFrame, received: Sequence[ReceivedMessage]) -> tuple[Perception, list[Rejection]]:
         """Fuse the messages that can be fused together, and reject the others; the state is stored."""
-        stored, known, now_ns = self.message_history.senders, self._known_senders, frame.timestamp_ns
+        stored, now_ns = self.message_history.senders, frame.timestamp_ns
         current = {reception.message.agent_id: reception for reception in received}
         failed: list[Rejection] = []
 
@@ -238,8 +240,8 @@ class Agent:
             usable = [reception for sender, reception in sorted(current.items()) if sender in senders]
             return self._try_perceive(frame, usable, (stored | current.keys()) - set(senders))
 
-        # Senders that were fused before come first: of two that cannot be fused together, the newer one is excluded.
-        senders = sorted(stored | current.keys(), key=lambda sender: (sender not in known, sender))
+        # Of two senders that cannot be fused together, the newer one is excluded.
+        senders = sorted(stored | current.keys(), key=lambda s: (first_fusion_ns(self._known_senders, s), s))
         try:
             done = attempt(senders)
         except Exception as error:
@@ -269,11 +271,6 @@ class Agent:
             return _Attempt(Perception(_remove_own_body(boxes, frame), usable, corrections), self._state)
         finally:
             self._restore(before)
-
-    @property
-    def _known_senders(self) -> frozenset[int]:
-        """Senders that were fused recently, by strategies with and without history."""
-        return self.message_history.senders.union(self._accepted_poses)
 
     @property
     def _state(self) -> _State:

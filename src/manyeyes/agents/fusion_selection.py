@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import torch
@@ -15,18 +15,39 @@ from manyeyes.comms.receiver_limits import ReceiverLimits
 from manyeyes.datatypes import AgentFrame, Message, SparseBev
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat
 
+KnownSenders = Mapping[int, tuple[int, int]]
+"""Times (ns) of the first and of the last fusion of senders, by agent id."""
+MAX_GAP_NS = 2_000_000_000
+"""A sender that was not fused for longer is unknown again."""
+
+
+def update_known_senders(known: KnownSenders, fused: Collection[int], now_ns: int) -> KnownSenders:
+    """Return the known senders after a fusion."""
+    current = {agent_id: (known[agent_id][0] if agent_id in known else now_ns, now_ns) for agent_id in fused}
+    return {a: (first, last) for a, (first, last) in {**known, **current}.items() if abs(now_ns - last) <= MAX_GAP_NS}
+
+
+def first_fusion_ns(known: KnownSenders, agent_id: int) -> float:
+    """Return the time of the first fusion of a sender, ns; infinite for an unknown one."""
+    return known[agent_id][0] if agent_id in known else math.inf
+
 
 def select_for_fusion(
-    frame: AgentFrame, received: Sequence[ReceivedMessage], known: Collection[int], limits: ReceiverLimits
+    frame: AgentFrame, received: Sequence[ReceivedMessage], known: KnownSenders, limits: ReceiverLimits
 ) -> tuple[list[ReceivedMessage], list[Rejection]]:
     """Return at most limits.max_fused_senders messages, with at most limits.max_fused_tokens tokens; and the senders left out.
 
-    Messages with content come before empty ones, then senders that were fused before, then the nearest. The tokens of one message
-    that exceed its share are left out in the order of their proposed confidence. known: senders that were fused before.
+    Messages with content come before empty ones, then senders in the order of their first fusion, so that new ones displace none,
+    then the nearest. The tokens of one message that exceed its share are left out in the order of their proposed confidence.
     """
     if len(received) > limits.max_fused_senders:
         order = sorted(
-            received, key=lambda r: (_is_empty(r.message), r.message.agent_id not in known, _distance_m(frame, r))
+            received,
+            key=lambda r: (
+                _is_empty(r.message),
+                first_fusion_ns(known, r.message.agent_id),
+                _distance_m(frame, r),
+            ),
         )
         selected = {r.message.agent_id for r in order[: limits.max_fused_senders]}
     else:
