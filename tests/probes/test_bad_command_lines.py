@@ -326,12 +326,9 @@ def test_a_bad_command_line_is_one_line(
     check(code, str(output.out), str(output.err), expected, seconds)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", CASES)
-def test_a_bad_command_line_is_one_line_of_a_process(
-    case: str, is_long: bool, files: dict[str, Path], tmp_path: Path
-) -> None:
-    if not is_long:
-        pytest.skip("set MANYEYES_PROBES=long")
+def test_a_bad_command_line_is_one_line_of_a_process(case: str, files: dict[str, Path], tmp_path: Path) -> None:
     line, _, expected = (part.strip().format(**files) for part in case.partition(" | "))
     environment = os.environ | {"MANYEYES_CACHE": str(tmp_path / "cache")}
     command = [sys.executable, "-m", "manyeyes.cli.main", *shlex.split(line)]

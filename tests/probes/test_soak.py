@@ -181,10 +181,9 @@ def test_a_receiver_holds_no_more_after_many_frames(tmp_path: Path) -> None:
     assert last.blocks - first.blocks < last.frame - first.frame
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("strategy", ["late-temporal", "intermediate"])
-def test_resident_memory_does_not_grow(strategy: str, is_long: bool, tmp_path: Path) -> None:
-    if not is_long:
-        pytest.skip("10,000 frames: make probes")
+def test_resident_memory_does_not_grow(strategy: str, tmp_path: Path) -> None:
     samples = run_soak(strategy, 10_000, tmp_path / "soak.json")
     slope = fit_slope(samples[len(samples) // 10 :])
     assert slope.high < MAX_KB_PER_FRAME, slope

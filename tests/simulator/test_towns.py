@@ -74,7 +74,7 @@ def test_errors_list_towns_places_and_remedy(nowhere: Path):
         find_town("Town05")
     with pytest.raises(ConfigError, match="missing-folder"):
         find_town("Town05", nowhere / "missing-folder")
-    with pytest.raises(ConfigError, match="whole number; got 'generated-x'"):
+    with pytest.raises(ConfigError, match="at most 18 digits; got 'generated-x'"):
         find_town("generated-x")
     (nowhere / "torn.whl").write_bytes(b"PK")
     with pytest.raises(ConfigError, match=r"torn\.whl: expected a wheel"):
