@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One writer a folder: the second one is refused by name, and a killed one blocks nobody."""
+"""One writer a folder: the second one is refused by name, and a killed one blocks none."""
 
 import os
 import re

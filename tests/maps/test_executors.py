@@ -85,7 +85,7 @@ class FakeRay:
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_a_ray_cluster_is_ended_by_whoever_began_it(monkeypatch, fails):
+def test_a_ray_cluster_is_ended_by_the_process_that_began_it(monkeypatch, fails):
     for initialized, address, wanted in (
         (True, None, []),
         (False, None, ["init at None with 3", "shutdown"]),

@@ -80,10 +80,10 @@ def unpack_varints(data: bytes, count: int) -> tuple[NDArray[np.int64], int]:
     return values, used
 
 
-def _check_room(count: int, most: int) -> None:
+def _check_room(count: int, max_count: int) -> None:
     """Refuse a count of values that these bytes cannot hold, before anything is allocated for it."""
-    if count > most:
-        raise PacketError("garbage", f"{count} values were announced; the bytes hold {most} at most.")
+    if count > max_count:
+        raise PacketError("garbage", f"{count} values were announced; the bytes hold {max_count} at most.")
 
 
 def _check_varints(used: int, whole: int, count: int) -> None:

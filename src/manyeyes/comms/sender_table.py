@@ -49,7 +49,7 @@ class HeldMessage:
 
     @property
     def timestamp_ns(self) -> int:
-        """Time of capture."""
+        """Time of capture of the message."""
         return self.assembly.header.timestamp_ns
 
 
@@ -86,7 +86,7 @@ class SenderTable:
         self._limits = limits
         self._senders: dict[int, Sender] = {}
         self._num_packets = 0
-        # Half of the memory is divided evenly, so that no sender exhausts that of others; the rest is for whoever needs more.
+        # Half of the memory is divided evenly, so that no sender exhausts that of others; the rest is for senders that need more.
         self._shared_memory = limits.max_total_bytes // 2
         self._own_memory = self._shared_memory // limits.max_senders
         self._max_counts: dict[ContentRefusal, int] = {
