@@ -3,6 +3,7 @@
 
 No exception, the receptions of the honest senders are those of a receiver without the mutated packets, and memory is bounded.
 ``make probes`` sends a million packets: ``python -m tests.probes.test_packets PACKETS`` prints what came of them.
+Resident memory there grows by kernels that oneDNN keeps (``test_soak``), unless ONEDNN_PRIMITIVE_CACHE_CAPACITY is small.
 """
 
 from __future__ import annotations
