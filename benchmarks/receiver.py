@@ -16,6 +16,7 @@ python benchmarks/receiver.py [--baseline COMMIT or FOLDER] [--instants 40] [--a
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import subprocess
 import sys
@@ -30,6 +31,10 @@ from typing import Any
 
 import numpy as np
 import torch
+
+# Both versions are compiled in this process: code that numba has cached in others may have symbols of one name in both.
+CACHE = tempfile.TemporaryDirectory()
+os.environ["NUMBA_CACHE_DIR"] = CACHE.name
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "src")]
@@ -203,7 +208,8 @@ def measure_attack(name: str, strategy: str, seen: Sequence[AgentFrame], instant
         honest = [agent.share(frame) for agent, frame in zip(senders, others)]
         packets = [packet for sent in honest for packet in sent]
         hostile = attack_packets(name, honest[0], ego.timestamp_ns) if instant else []
-        struck.perception_cache.process(ego), clean.perception_cache.process(ego)
+        for agent in (struck, clean):
+            agent.perception_cache.process(ego)
         found, row = [], []
         for agent, content in ((clean, packets), (struck, [*hostile, *packets])):
             release_memory()

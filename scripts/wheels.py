@@ -171,7 +171,8 @@ def build(place: Path) -> tuple[Path, Path]:
         call([python, "-m", "hatchling", "build", "-t", target, "-d", str(place / "dist")], REPOSITORY, env)
     (sdist,), (wheel,) = (place / "dist").glob("*.tar.gz"), (place / "dist").glob("*.whl")
     with tarfile.open(sdist) as archive:
-        archive.extractall(place / "sdist", filter="data")
+        archive.extraction_filter = getattr(tarfile, "data_filter", None)  # in Python 3.11.4 and later
+        archive.extractall(place / "sdist")
     (sources,) = (place / "sdist").iterdir()
     call([python, "-m", "hatchling", "build", "-t", "wheel", "-d", str(place / "again")], sources, env)
     (again,) = (place / "again").glob("*.whl")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from manyeyes._lock import LOCK, FolderInUseError, hold_folder
+from manyeyes._lock import LOCK, FolderInUseError, hold_folder, share_folder
 
 _HOLD = """
 import sys, time
@@ -78,3 +78,38 @@ def test_the_lock_of_a_folder_that_was_removed_leaves_that_of_the_next_holder(tm
             (folder / LOCK).rename(folder / "kept")
             (folder / "kept").rename(folder / LOCK)
     assert [path.name for path in folder.iterdir()] == ["result"]
+
+
+def test_sharers_are_beside_each_other_and_the_first_cleans_up(tmp_path: Path) -> None:
+    cleaned: list[str] = []
+    (tmp_path / LOCK).write_text("of a killed process")
+    with share_folder(tmp_path, lambda: cleaned.append("first")):
+        second = share_folder(tmp_path, lambda: cleaned.append("second"))
+        with second, pytest.raises(FolderInUseError), hold_folder(tmp_path):
+            pass
+        assert (tmp_path / LOCK).exists()
+    assert cleaned == ["first"] and not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_is_held_alone_is_not_shared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("manyeyes._lock._WAIT_S", 0)
+    with hold_folder(tmp_path), pytest.raises(FolderInUseError), share_folder(tmp_path, lambda: None):
+        pass
+
+
+def test_a_study_removes_what_killed_ones_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from types import SimpleNamespace
+
+    from manyeyes.studies import catalog
+
+    left = [tmp_path / "cells" / ".a.cell.1.unfinished", tmp_path / ".a.json.1.unfinished"]
+    kept = [tmp_path / "cells" / "a.cell", tmp_path / "other" / ".b.cell.1.unfinished"]
+    for path in (*left, *kept):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("")
+    seen: list[list[bool]] = []
+    study = SimpleNamespace(run=lambda options, context: seen.append([path.exists() for path in (*left, *kept)]))
+    monkeypatch.setitem(sys.modules, "manyeyes.studies.fake", study)  # pyright: ignore[reportArgumentType]
+    monkeypatch.setitem(catalog.STUDIES, "fake", catalog.Study("", "", "fake", "StudyOptions"))
+    catalog.run_study("fake", SimpleNamespace(out=tmp_path))
+    assert seen == [[False, False, True, True]]

@@ -9,7 +9,8 @@ import os
 import shlex
 import socket
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,6 +20,10 @@ from manyeyes.datatypes.errors import ManyeyesError
 
 LOCK = ".lock"
 """Name of the lock file in a folder; it names the process that holds the lock, and is deleted with the lock."""
+
+
+# A process that begins to share holds the folder alone for the time of cleaning.
+_TRIES, _WAIT_S = 40, 0.05
 
 
 class FolderInUseError(ManyeyesError):
@@ -35,21 +40,80 @@ def hold_folder(folder: Path) -> Iterator[None]:
     Raises:
         FolderInUseError: another process holds the lock; the text names its id, host, start time and command.
     """
+    with _remove_empty(folder):
+        path = folder / LOCK
+        handle = _acquire(path)
+        try:
+            yield
+        finally:
+            _release(handle, path)
+
+
+@contextmanager
+def share_folder(folder: Path, clean: Callable[[], object]) -> Iterator[None]:
+    """Hold a folder together with other processes that share it, against those that hold it alone (:func:`hold_folder`).
+
+    clean: called when no other process holds the folder, to remove what killed ones left.
+
+    Raises:
+        FolderInUseError: another process holds the folder alone.
+    """
+    with _remove_empty(folder):
+        path = folder / LOCK
+        handle = _acquire_shared(path, clean)
+        try:
+            yield
+        finally:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                os.close(handle)
+            else:
+                _release(handle, path)
+
+
+@contextmanager
+def _remove_empty(folder: Path) -> Iterator[None]:
+    """Remove at the end the folders that were made for this one and are empty."""
     made = [path for path in (folder, *folder.parents) if not path.exists()]
-    path = folder / LOCK
-    handle = _acquire(path)
     try:
         yield
     finally:
-        if _is_file_of(handle, path):
-            path.unlink()
-        os.close(handle)
         with contextlib.suppress(OSError):  # not empty
             for made_folder in made:
                 made_folder.rmdir()
 
 
-def _acquire(path: Path) -> int:
+def _release(handle: int, path: Path) -> None:
+    if _is_file_of(handle, path):
+        path.unlink()
+    os.close(handle)
+
+
+def _acquire_shared(path: Path, clean: Callable[[], object]) -> int:
+    """Open the file and lock it for sharing; whoever holds it alone at first cleans up, which others wait for."""
+    for _ in range(_TRIES):
+        with contextlib.suppress(FolderInUseError):
+            handle = _acquire(path)
+            try:
+                clean()
+                fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+                if _is_file_of(handle, path):
+                    return handle
+            except BlockingIOError:  # another process was faster between the two locks
+                pass
+            except BaseException:
+                os.close(handle)
+                raise
+            os.close(handle)
+            continue
+        with contextlib.suppress(FolderInUseError):
+            return _acquire(path, fcntl.LOCK_SH)
+        time.sleep(_WAIT_S)
+    return _acquire(path, fcntl.LOCK_SH)
+
+
+def _acquire(path: Path, mode: int = fcntl.LOCK_EX) -> int:
     """Open and lock the file, and write the name of this process to it."""
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -59,7 +123,7 @@ def _acquire(path: Path) -> int:
             continue
         try:
             with name_errors(path):
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(handle, mode | fcntl.LOCK_NB)
                 if _is_file_of(handle, path):  # else its last holder deleted it after it was opened here
                     os.ftruncate(handle, 0)
                     os.pwrite(handle, _describe_process().encode(), 0)
@@ -86,6 +150,6 @@ def _is_file_of(handle: int, path: Path) -> bool:
 
 def _describe_process() -> str:
     """Id, host, time and command; the command's path is left out."""
-    time = datetime.now(UTC).isoformat(timespec="seconds")
+    started = datetime.now(UTC).isoformat(timespec="seconds")
     command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
-    return f"process {os.getpid()} on {socket.gethostname()} (since {time}: {command})\n"
+    return f"process {os.getpid()} on {socket.gethostname()} (since {started}: {command})\n"

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -74,7 +76,16 @@ def run_study(name: str, options: Any) -> None:
     """Run a study; stored results are not computed again."""
     from rich.console import Console
 
+    from manyeyes._lock import share_folder
     from manyeyes.studies.engine.report import StudyContext
 
     module = importlib.import_module(f"manyeyes.studies.{STUDIES[name].module}")
-    module.run(options, StudyContext(name, options, Console()))
+    with share_folder(options.out, partial(_remove_unfinished_cells, options.out)):
+        module.run(options, StudyContext(name, options, Console()))
+
+
+def _remove_unfinished_cells(out: Path) -> None:
+    from manyeyes._io import remove_unfinished
+
+    for folder in (out, *out.glob("cells*")):
+        remove_unfinished(folder, below=False)
