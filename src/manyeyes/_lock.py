@@ -91,22 +91,14 @@ def _release(handle: int, path: Path) -> None:
 
 
 def _acquire_shared(path: Path, clean: Callable[[], object]) -> int:
-    """Open the file and lock it for sharing; whoever holds it alone at first cleans up, which others wait for."""
+    """Clean up where no other process holds the lock, then lock the file for sharing."""
+    with contextlib.suppress(FolderInUseError):
+        handle = _acquire(path)
+        try:
+            clean()
+        finally:
+            _release(handle, path)
     for _ in range(_TRIES):
-        with contextlib.suppress(FolderInUseError):
-            handle = _acquire(path)
-            try:
-                clean()
-                fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
-                if _is_file_of(handle, path):
-                    return handle
-            except BlockingIOError:  # another process was faster between the two locks
-                pass
-            except BaseException:
-                os.close(handle)
-                raise
-            os.close(handle)
-            continue
         with contextlib.suppress(FolderInUseError):
             return _acquire(path, fcntl.LOCK_SH)
         time.sleep(_WAIT_S)
@@ -114,7 +106,7 @@ def _acquire_shared(path: Path, clean: Callable[[], object]) -> int:
 
 
 def _acquire(path: Path, mode: int = fcntl.LOCK_EX) -> int:
-    """Open and lock the file, and write the name of this process to it."""
+    """Open and lock the file, alone or (LOCK_SH) with others, and write the name of this process to it."""
     while True:
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
