@@ -18,6 +18,7 @@ import torch
 from manyeyes.datasets.base import Recording, iter_eval_frames
 from manyeyes.datatypes import BevGrid, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.ops.keyed_random import keyed_generator
+from manyeyes.training.detector.sensor_augmentation import SensorAugmentation, SensorAugmentConfig
 from manyeyes.training.mirroring import mirror_factors, resize_cloud, resize_transform
 
 MAX_BUDGET_TOKENS = 1500
@@ -35,6 +36,7 @@ class AugmentConfig:
         max_point_dropout: maximum fraction of dropped points.
         early_fusion_prob: probability that all clouds are merged into the ego's, as in early fusion.
         max_agents: maximum number of agents, ego included, of a random number; from 99 on all agents.
+        sensors: sensors of the agents, drawn anew for every sample; None for those of the recording.
     """
 
     max_yaw_rad: float = math.pi / 4
@@ -43,6 +45,7 @@ class AugmentConfig:
     max_point_dropout: float = 0.3
     early_fusion_prob: float = 0.15
     max_agents: int = 5
+    sensors: SensorAugmentConfig | None = None
 
     @classmethod
     def none(cls) -> AugmentConfig:
@@ -141,7 +144,7 @@ def make_sample(
     """
     degradation = degradation or DegradationConfig()
     rng = keyed_generator("augment", *key)
-    scene = _AugmentedScene(snapshots, rng, config)
+    scene = _AugmentedScene(snapshots, rng, config, key)
     now = snapshots[-1]
     chosen = _choose_agents(len(now.frames), ego, config.max_agents, rng)
     ids = [now.frames[i].agent_id for i in chosen]
@@ -219,12 +222,20 @@ def _degraded_views(
 class _AugmentedScene:
     """The snapshots of one sample, with every agent's frame rotated by its own angle."""
 
-    def __init__(self, moments: Sequence[Snapshot], rng: np.random.Generator, config: AugmentConfig) -> None:
+    def __init__(
+        self, moments: Sequence[Snapshot], rng: np.random.Generator, config: AugmentConfig, key: tuple[int | str, ...]
+    ) -> None:
         self._moments, self._rng, self._config = moments, rng, config
+        ids = tuple(frame.agent_id for frame in moments[-1].frames)
         self._turn = {
-            frame.agent_id: Transform.from_xyz_yaw(0, 0, 0, config.max_yaw_rad * rng.uniform(-1, 1))
-            for frame in moments[-1].frames
+            agent_id: Transform.from_xyz_yaw(0, 0, 0, config.max_yaw_rad * rng.uniform(-1, 1)) for agent_id in ids
         }
+        self._sensors = None if config.sensors is None else SensorAugmentation(config.sensors, ids, key)
+        if self._sensors is not None:
+            self._turn = {
+                agent_id: turn @ self._sensors.sensor(agent_id).frame_from_measured
+                for agent_id, turn in self._turn.items()
+            }
 
     def _row(self, back: int, agent_id: int) -> int | None:
         if back >= len(self._moments):
@@ -244,7 +255,9 @@ class _AugmentedScene:
         row = self._row(back, agent_id)
         if row is None:
             return None
-        cloud = self._moments[-1 - back].frames[row].points.transform(self._turn[agent_id].inverse())
+        frame = self._moments[-1 - back].frames[row]
+        points = frame.points if self._sensors is None else self._sensors.points(frame)
+        cloud = points.transform(self._turn[agent_id].inverse())
         if self._config.max_point_dropout:
             thin = self._config.max_point_dropout * self._rng.random()
             cloud = cloud[torch.from_numpy(self._rng.random(len(cloud)) >= thin)]
@@ -281,7 +294,8 @@ class _AugmentedScene:
     def _previous_cloud(self, back: int, agent_id: int, frame: Transform) -> PointCloud:
         """Return an agent's previous sweep, motion-compensated to a frame; empty where there is none."""
         pose, cloud = self.pose(back + 1, agent_id), self.cloud(back + 1, agent_id)
-        if pose is None or cloud is None:
+        is_single = self._sensors is not None and self._sensors.sensor(agent_id).is_single_sweep
+        if pose is None or cloud is None or is_single:
             return PointCloud.of(torch.zeros(0, 3))
         return cloud.transform(frame.inverse() @ pose)
 
