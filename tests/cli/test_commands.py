@@ -217,6 +217,28 @@ def test_train_writes_weights_log_picture_and_json(data, tmp_path, capsys) -> No
     assert len((tmp_path / "run" / "log.jsonl").read_text().splitlines()) == 2
 
 
+@pytest.mark.slow
+@pytest.mark.training
+def test_train_runs_a_plan_on_a_mixture_and_goes_on_with_it(data, tmp_path) -> None:
+    out = tmp_path / "run"
+    words = ("--preset", "costr-tiny/plan", "--steps", 1, "--batch", 1, "--seed", 4, "--out", out)
+    command = ("train", "--data", data, data, "--split", "test", "--data-weights", 2, 1, *words)
+    assert run(*command) == 0
+    assert {p.name for p in out.iterdir()} == {"stage1", "stage2", "codebook", "weights.safetensors", "train.json"}
+    assert {p.name for p in (out / "stage2").iterdir()} >= {"weights.safetensors", "log.jsonl", "loss.png"}
+    card = checkpoint.read_card(out / "weights.safetensors")
+    assert [stage["seed"] for stage in card["stages"]] == [4, 5] and card["codebook"]["seed"] == 6
+    assert (card["preset"], card["data"]) == ("costr-tiny/plan", [str(data), str(data)])
+    before = checkpoint.load(out / "weights.safetensors").fingerprint
+    assert run(*command) == 0
+    assert checkpoint.load(out / "weights.safetensors").fingerprint == before
+
+
+def test_train_needs_one_weight_a_recording(data, capsys) -> None:
+    assert run("train", "--data", data, data, "--data-weights", 1, "--split", "test") == 1
+    assert "A mixture of 2 recordings needs 2 positive weights; got [1.0]" in capsys.readouterr().err
+
+
 def test_the_recording_of_the_tests_round_trips(data) -> None:
     recording = Opv2vRecording(data, "test", use_cache=False)
     assert recording.eval_indices("a") == range(1, 3) and recording.agents("a") == (5, -1)

@@ -30,7 +30,7 @@ def recorded(tmp_path_factory):
 @pytest.mark.slow
 def test_train_then_judge(recorded, tmp_path, capsys):
     out = tmp_path / "run"
-    train.main(train.Options(recorded, preset="map-tiny", out=out, steps=2, batch=1))
+    train.main(train.Options((recorded,), preset="map-tiny", out=out, steps=2, batch=1))
     weights = out / "weights.safetensors"
     model = checkpoint.load_as(weights, FORMAT, MapModelConfig, MapModel)
     assert model.config.tile.x_max == 60.0 and (out / "loss.png").exists() and (out / "train.json").exists()
@@ -53,13 +53,13 @@ def test_true_maps_are_those_of_the_scenarios_towns(recorded):
 
 def test_an_unknown_preset_names_the_map_presets():
     with pytest.raises(ConfigError, match="map-small-lidar"):
-        train.main(train.Options(Path("nowhere"), preset="map-large"))
+        train.main(train.Options((Path("nowhere"),), preset="map-large"))
 
 
 @pytest.mark.slow
 def test_a_model_with_cameras_needs_pictures(recorded, capsys):
     with pytest.raises(ConfigError, match="no pictures in generated-1_0000"):
-        train.main(train.Options(recorded, preset="map-small-camera"))
+        train.main(train.Options((recorded,), preset="map-small-camera"))
     # Of the models that ship those are evaluated whose sensors the recording has.
     options = MapModelOptions(data=recorded, split="test")
     assert [model.sensors for model in model_study.resolve_models(options)] == ["LiDAR"]

@@ -17,7 +17,7 @@ from manyeyes.studies.catalog import STUDIES, load_options, run_study
 COMMANDS = {
     "demo": "simulate a drive, run every fusion method on it, and write a table, figures, an animation and a report",
     "simulate": "simulate scenes from a seed, in OPV2V's layout",
-    "train": "train a detector on a recording",
+    "train": "train a detector on recordings: one stage, or all from nothing to what ships",
     "fit-codebook": "fit the codebook that quantises the tokens of trained weights",
     "evaluate": "evaluate methods on a split: AP with intervals, bytes, paired differences",
     "replay": "replay your own recording as demo does",

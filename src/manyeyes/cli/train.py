@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trains a detector or a map model on a recording, or FeaKM on what a detector sees; goes on where a stopped run was.
+"""Trains a detector or a map model on recordings, or FeaKM on what a detector sees; goes on where a stopped run was.
+
+A plan (costr-small, costr-base) trains several stages and fits the codebook, from nothing to the weights that ship.
 
 Several processes: torchrun -m manyeyes.cli.main train.
 """
@@ -11,50 +13,57 @@ import os
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from manyeyes._bounds import BatchSize, LearningRate, OutputFolder, PositiveInt, Seed, WorkerCount
+from manyeyes._bounds import BatchSize, LearningRate, OutputFolder, PositiveFloat, PositiveInt, Seed, WorkerCount
 from manyeyes.studies.replay_options import FileChecks
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress as ProgressBars
 
-    from manyeyes.datasets.base import Recording
+    from manyeyes.datasets.base import Recording, RecordingReader
     from manyeyes.datasets.missing import MissingFiles
     from manyeyes.models.detector.protocols import BoxDetector
+    from manyeyes.training.detector.plan import TrainPlan
     from manyeyes.training.maps.task import MapTask, MapTrainConfig
     from manyeyes.training.pose.feakm import FeakmTask, FeakmTrainConfig
     from manyeyes.training.pose.feakm_cache import FeatureCache
     from manyeyes.training.trainer import Task, TrainConfig
 
+_Config = TypeVar("_Config", bound="TrainConfig")
+
 
 @dataclass(frozen=True)
 class Options:
-    """Which recording, which settings, where to."""
+    """Which recordings, which settings, where to."""
 
-    data: Path
-    """A data set, a folder of scenarios, or one scenario: OPV2V, DAIR-V2X, Argoverse 2, or the layout of a registered reader."""
+    data: tuple[Path, ...]
+    """Data sets, folders of scenarios, or single scenarios: OPV2V, DAIR-V2X, Argoverse 2, or the layout of a registered reader.
+    Several are mixed: samples are uniform over the scenarios of all."""
     split: str | None = "train"
-    """Which split of a dataset: a folder inside it."""
+    """Which split of every dataset: a folder inside it."""
+    data_weights: tuple[PositiveFloat, ...] = ()
+    """Probability that a sample comes from each of the recordings, up to a common factor, instead of by numbers of scenarios."""
     preset: str = "costr-small/stage1"
-    """Settings by name; an unknown name lists the known ones."""
+    """Settings by name, of a stage or of a plan of stages; an unknown name lists the known ones."""
     out: OutputFolder | None = None
-    """Folder of the run, runs/PRESET by default: weights.safetensors, log.jsonl, loss.png, train.json, last.pt to go on from."""
+    """Folder of the run, runs/PRESET by default: weights.safetensors, log.jsonl, loss.png, train.json, last.pt to go on from;
+    of a plan one such folder for each stage, and the final weights.safetensors."""
     seed: Seed = 0
-    """Of weights, samples and augmentation."""
+    """Of weights, samples and augmentation; stage k of a plan, from 0, has the seed plus k."""
     steps: PositiveInt | None = None
-    """Steps of the optimiser, instead of the preset's."""
+    """Steps of the optimiser, instead of the preset's; of a plan those of each stage."""
     batch: BatchSize | None = None
     """Samples a step over all processes, instead of the preset's."""
     learning_rate: LearningRate | None = None
-    """Instead of the preset's."""
+    """Instead of the preset's; of a plan that of each stage."""
     fusion: str | None = None
     """Fusion module of a detector by name, one of your own too, instead of the preset's; an unknown name lists the known ones."""
     weights: tuple[Path, ...] = ()
-    """Weights to begin from instead of random ones, such as those of the stage before. Of a map model several, each what it has in
-    common with the preset, the first before the others. For feakm and feakm-paper the detector whose view they match, a shipped
-    one by default."""
+    """Weights to begin from instead of random ones, such as those of the stage before; of a plan, its first stage. Of a map model
+    several, each what it has in common with the preset, the first before the others. For feakm and feakm-paper the detector whose
+    view they match, a shipped one by default."""
     threads: WorkerCount = 1
     """Threads of torch in each process; the result is the same only for the same number."""
     checks: FileChecks = field(default_factory=FileChecks)
@@ -69,7 +78,7 @@ def main(options: Options) -> None:
 
     from manyeyes._lock import hold_folder
 
-    config, out = make_config(options), options.out or Path("runs") / options.preset
+    chosen, out = choose_preset(options), options.out or Path("runs") / options.preset
     torch.set_num_threads(options.threads)
     is_distributed = int(os.environ.get("WORLD_SIZE", "1")) > 1
     if is_distributed:
@@ -77,34 +86,47 @@ def main(options: Options) -> None:
     is_first = not is_distributed or dist.get_rank() == 0
     try:
         with hold_folder(out) if is_first else nullcontext():
-            _train(options, config, out, Console(quiet=not is_first))
+            _train(options, chosen, out, Console(quiet=not is_first))
     finally:
         if is_distributed:
             dist.destroy_process_group()
 
 
-def make_config(options: Options) -> TrainConfig:
-    """Make the configuration of the preset with what the options replace.
+def choose_preset(options: Options) -> TrainConfig | TrainPlan:
+    """Return the configuration or the plan of the preset with what the options replace.
 
     Raises:
         ConfigError: the preset is unknown, takes only one file of weights, or has no fusion module.
     """
     from manyeyes.datatypes import ConfigError
     from manyeyes.training.maps.task import MapTrainConfig
-    from manyeyes.training.presets import TRAINING_PRESETS
+    from manyeyes.training.presets import TRAINING_PLANS, TRAINING_PRESETS
 
-    if options.preset not in TRAINING_PRESETS:
-        raise ConfigError(f"No training preset {options.preset!r}; choose one of {', '.join(TRAINING_PRESETS)}.")
-    config = TRAINING_PRESETS[options.preset]
-    if len(options.weights) > 1 and not isinstance(config, MapTrainConfig):
+    chosen = {**TRAINING_PRESETS, **TRAINING_PLANS}.get(options.preset)
+    if chosen is None:
+        known = ", ".join((*TRAINING_PLANS, *TRAINING_PRESETS))
+        raise ConfigError(f"No training preset {options.preset!r}; choose one of {known}.")
+    if len(options.weights) > 1 and not isinstance(chosen, MapTrainConfig):
         raise ConfigError(f"--weights takes one file for {options.preset}; got {len(options.weights)}.")
-    if options.fusion is not None:
-        config = _with_fusion(config, options.fusion)
     given = {name: getattr(options, name) for name in ("steps", "batch", "learning_rate")}
-    return replace(config, **{name: value for name, value in given.items() if value is not None})
+    given = {name: value for name, value in given.items() if value is not None}
+    if options.preset in TRAINING_PRESETS:
+        return _change_config(TRAINING_PRESETS[options.preset], options.fusion, given)
+    plan = TRAINING_PLANS[options.preset]
+    stages = ((name, _change_config(config, options.fusion, given)) for name, config in plan.stages)
+    released = (
+        plan.released
+        if plan.released is None or options.fusion is None
+        else replace(plan.released, fusion=options.fusion)
+    )
+    return replace(plan, stages=tuple(stages), released=released)
 
 
-def _with_fusion(config: TrainConfig, fusion: str) -> TrainConfig:
+def _change_config(config: _Config, fusion: str | None, given: dict[str, Any]) -> _Config:
+    return replace(config if fusion is None else _with_fusion(config, fusion), **given)
+
+
+def _with_fusion(config: _Config, fusion: str) -> _Config:
     from manyeyes.datatypes import ConfigError
     from manyeyes.models.fusion.registry import get_fusion
     from manyeyes.training.detector.task import DetectorTrainConfig
@@ -115,42 +137,117 @@ def _with_fusion(config: TrainConfig, fusion: str) -> TrainConfig:
     return replace(config, detector=replace(config.detector, fusion=fusion))
 
 
-def _train(options: Options, config: TrainConfig, out: Path, console: Console) -> None:
+def _train(options: Options, chosen: TrainConfig | TrainPlan, out: Path, console: Console) -> None:
     from manyeyes._io import remove_unfinished
-    from manyeyes.studies import provenance
-    from manyeyes.studies.map_recordings import open_sensor_recording
+    from manyeyes.datasets.mixed import open_recordings
+    from manyeyes.studies.map_recordings import check_images
     from manyeyes.studies.recordings import check_files
+    from manyeyes.training.detector.plan import TrainPlan
     from manyeyes.training.maps.task import MapTrainConfig
-    from manyeyes.training.trainer import Progress, Trainer
-    from manyeyes.viz.loss_curve import save_loss_curve
     from manyeyes.viz.progress import make_progress_bars
-    from manyeyes.viz.table import missing_footer
 
-    sensors = config.map_model.bev.sensors if isinstance(config, MapTrainConfig) else ("lidar",)
-    recording = open_sensor_recording(options.data, options.split, sensors)
+    has_cameras = isinstance(chosen, MapTrainConfig) and "camera" in chosen.map_model.bev.sensors
+    recording = open_recordings(options.data, options.split, images=has_cameras, weights=options.data_weights)
+    if has_cameras:
+        check_images(recording, " ".join(map(str, options.data)))
     missing = check_files(recording, options.checks, console)
     if not console.quiet:
-        remove_unfinished(out, below=False)
+        remove_unfinished(out, below=isinstance(chosen, TrainPlan))
     with make_progress_bars(console) as bars:
-        task = _make_task(options, config, recording, missing, bars)
-        settings = {"options": options, "training": task.config}
-        origin = provenance.collect_provenance(settings, options.seed)
-        trainer = Trainer(task, out)
-        row = bars.add_task("Training", total=task.steps)
+        if isinstance(chosen, TrainPlan):
+            run = _train_plan(options, chosen, out, recording, bars)
+        else:
+            run = _train_stage(options, chosen, out, recording, missing, bars)
+    if not console.quiet:
+        _write_record(options, run, missing, out, console)
 
-        def report(at: Progress) -> None:
-            shown = [f"{name} {at.terms[name]:.2f}" for name in task.shown_terms]
-            bars.update(row, completed=at.step, description=", ".join((f"loss {at.loss:.3f}", *shown)))
 
-        weights = trainer.run({name: origin[name] for name in ("command", "versions", "git_commit")}, report)
-    if console.quiet:
-        return
-    save_loss_curve(out / "log.jsonl", out / "loss.png")
-    result = {"weights": weights.name, "loss": trainer.loss, "seconds": trainer.seconds, "missing": missing}
-    provenance.write_json(out / "train.json", result, settings, options.seed)
+@dataclass(frozen=True)
+class _FinishedRun:
+    """What a run is recorded by: its settings, weights, last loss, time, and the folders with a log."""
+
+    settings: TrainConfig | TrainPlan
+    weights: Path
+    loss: float | None
+    seconds: float
+    log_folders: tuple[Path, ...]
+
+
+def _write_record(options: Options, run: _FinishedRun, missing: MissingFiles, out: Path, console: Console) -> None:
+    """Write train.json and the curves of the loss, and print where they are."""
+    from manyeyes.studies import provenance
+    from manyeyes.viz.loss_curve import save_loss_curve
+    from manyeyes.viz.table import missing_footer
+
+    for folder in run.log_folders:
+        save_loss_curve(folder / "log.jsonl", folder / "loss.png")
+    result = {"weights": run.weights.name, "loss": run.loss, "seconds": run.seconds, "missing": missing}
+    provenance.write_json(out / "train.json", result, {"options": options, "training": run.settings}, options.seed)
     if missing.count:
         console.print(missing_footer(missing.count, "train.json"), highlight=False, soft_wrap=True)
-    console.print(f"{weights}; the loss over steps is in {out / 'loss.png'}", highlight=False, soft_wrap=True)
+    shown = " and ".join(str(folder / "loss.png") for folder in run.log_folders)
+    text = f"{run.weights}; the loss over steps is in {shown}" if shown else str(run.weights)
+    console.print(text, highlight=False, soft_wrap=True)
+
+
+def _make_card(options: Options, settings: TrainConfig | TrainPlan) -> dict[str, Any]:
+    from manyeyes.studies import provenance
+
+    origin = provenance.collect_provenance({"options": options, "training": settings}, options.seed)
+    return {name: origin[name] for name in ("command", "versions", "git_commit")}
+
+
+def _train_stage(
+    options: Options,
+    config: TrainConfig,
+    out: Path,
+    recording: RecordingReader,
+    missing: MissingFiles,
+    bars: ProgressBars,
+) -> _FinishedRun:
+    from manyeyes.training.trainer import Progress, Trainer
+
+    task = _make_task(options, config, recording, missing, bars)
+    card = _make_card(options, task.config)
+    trainer = Trainer(task, out)
+    row = bars.add_task("Training", total=task.steps)
+
+    def report(at: Progress) -> None:
+        shown = [f"{name} {at.terms[name]:.2f}" for name in task.shown_terms]
+        bars.update(row, completed=at.step, description=", ".join((f"loss {at.loss:.3f}", *shown)))
+
+    weights = trainer.run(card, report)
+    return _FinishedRun(task.config, weights, trainer.loss, trainer.seconds, (out,))
+
+
+def _train_plan(
+    options: Options, plan: TrainPlan, out: Path, recording: RecordingReader, bars: ProgressBars
+) -> _FinishedRun:
+    """Run what is left of a plan, with a progress bar for each stage that is trained now."""
+    from contextlib import ExitStack
+
+    from manyeyes.models import checkpoint, pretrained
+    from manyeyes.training.detector.plan import PlanRun
+    from manyeyes.training.trainer import Progress
+
+    rows: dict[str, Any] = {}
+    last: Progress | None = None
+
+    def report(stage: str, at: Progress) -> None:
+        nonlocal last
+        if stage not in rows:
+            rows[stage] = bars.add_task(stage, total=at.steps)
+        bars.update(rows[stage], completed=at.step, description=f"{stage}: loss {at.loss:.3f}")
+        last = at
+
+    with ExitStack() as files:
+        given = next(iter(map(str, options.weights)), plan.start)
+        start = files.enter_context(pretrained.open_detector_file(given)) if given else None
+        card = {**_make_card(options, plan), "preset": options.preset, "data": [str(path) for path in options.data]}
+        weights = PlanRun(plan, recording, options.seed, out, start).run(card, report)
+    seconds = checkpoint.read_card(weights)["train_seconds"]
+    folders = tuple(out / name for name, _ in plan.stages if (out / name / "log.jsonl").exists())
+    return _FinishedRun(plan, weights, last.loss if last else None, seconds, folders)
 
 
 def _make_task(
@@ -204,9 +301,8 @@ def _load_or_cache_features(
     from manyeyes.training.pose.feakm_cache import build_cache, select_snapshots
 
     missing_key = f"|{missing}" if missing.count else ""
-    digest = hashlib.blake2b(
-        f"{options.data.resolve()}|{options.split}{missing_key}".encode(), digest_size=4
-    ).hexdigest()
+    data = "|".join(str(path.resolve()) for path in options.data)
+    digest = hashlib.blake2b(f"{data}|{options.split}{missing_key}".encode(), digest_size=4).hexdigest()
     row = bars.add_task("Detecting", total=len(select_snapshots(recording)))
     cache = None
     for cache in build_cache(recording, detector, Path("runs") / "views" / digest):

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from manyeyes.datasets.dair_v2x.reader import DairRecording as DairRecording
     from manyeyes.datasets.dair_v2x.writer import DairWriter as DairWriter
     from manyeyes.datasets.missing import FileProblem as FileProblem, MissingFiles as MissingFiles
+    from manyeyes.datasets.mixed import MixedRecording as MixedRecording, open_recordings as open_recordings
     from manyeyes.datasets.opv2v.reader import Opv2vRecording as Opv2vRecording
     from manyeyes.datasets.opv2v.writer import Opv2vWriter as Opv2vWriter
     from manyeyes.datasets.perturbation import FrameDelay as FrameDelay, PoseNoise as PoseNoise

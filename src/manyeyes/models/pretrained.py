@@ -104,6 +104,13 @@ def load_map_model_state(name_or_path: str | Path = DEFAULT_MAP_MODEL) -> dict[s
 
 
 @contextmanager
+def open_detector_file(name_or_path: str | Path = DEFAULT_DETECTOR) -> Iterator[Path]:
+    """Give the path of the file of a shipped detector by name, or of a .safetensors file, while the context lasts."""
+    with _weights_file(name_or_path, _shipped_detectors()) as path:
+        yield path
+
+
+@contextmanager
 def _weights_file(name_or_path: str | Path, names: tuple[str, ...]) -> Iterator[Path]:
     """Open the file of shipped weights of one of these names, or of a path."""
     name = str(name_or_path)

@@ -15,15 +15,26 @@ if TYPE_CHECKING:
 def open_sensor_recording(data: Path, split: str | None, sensors: Sequence[str]) -> RecordingReader:
     """Return the recording with what these sensors took: pictures are read where a model has cameras, and must then be there."""
     from manyeyes.datasets.registry import open_recording
-    from manyeyes.datatypes import ConfigError
 
     recording = open_recording(data, split, images="camera" in sensors)
-    if "camera" in sensors and not has_images(recording):
+    if "camera" in sensors:
+        check_images(recording, str(data))
+    return recording
+
+
+def check_images(recording: Recording, data: str) -> None:
+    """Refuse a recording without pictures; data: its name for the error.
+
+    Raises:
+        ConfigError: no agent of the first snapshot has pictures.
+    """
+    from manyeyes.datatypes import ConfigError
+
+    if not has_images(recording):
         raise ConfigError(
             f"{data}: no pictures in {recording.scenarios[0]}, and the model has cameras; give a recording of 'manyeyes simulate "
             "--preset carla-maps-camera' (or any preset with --cameras), or a model of agents with LiDAR."
         )
-    return recording
 
 
 def has_images(recording: Recording) -> bool:

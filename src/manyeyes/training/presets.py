@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from manyeyes.training.detector.presets import DETECTOR_TRAINING_PRESETS
+from manyeyes.training.detector.plan import TrainPlan
+from manyeyes.training.detector.presets import DETECTOR_PLANS, DETECTOR_TRAINING_PRESETS
 from manyeyes.training.maps.presets import MAP_TRAINING_PRESETS
 from manyeyes.training.pose.feakm import FEAKM_TRAINING_PRESETS
 from manyeyes.training.trainer import TrainConfig
@@ -13,3 +14,6 @@ TRAINING_PRESETS: dict[str, TrainConfig] = {
     **FEAKM_TRAINING_PRESETS,
     **MAP_TRAINING_PRESETS,
 }
+
+TRAINING_PLANS: dict[str, TrainPlan] = DETECTOR_PLANS
+"""Plans of several stages by name; no name is that of a preset of one stage."""

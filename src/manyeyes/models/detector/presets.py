@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from manyeyes.datatypes import BevGrid
 from manyeyes.models.detector.box_head import DecodeConfig
 from manyeyes.models.detector.detector import DetectorConfig
@@ -14,6 +16,11 @@ OPV2V_GRID = BevGrid(-140.8, -38.4, -3.0, 140.8, 38.4, 3.0)
 
 SMALL_SQUARE_GRID = BevGrid(-70.4, -70.4, -5.0, 70.4, 70.4, 6.0)
 """Equal range in all directions: what lies beside one agent may lie ahead of another."""
+
+BASE_GRID = BevGrid(-140.8, -38.4, -5.0, 140.8, 38.4, 6.0)
+"""OPV2V's range, with the heights of costr-small: sensors on poles, and slopes."""
+
+BASE_SQUARE_GRID = BevGrid(-140.8, -140.8, -5.0, 140.8, 140.8, 6.0)
 
 COSTR_SMALL = DetectorConfig(
     grid=SMALL_GRID,
@@ -27,6 +34,9 @@ COSTR_SMALL = DetectorConfig(
     sweeps=2,
 )
 """Half of OPV2V's range and a narrow network: trains on two CPU cores in about an hour."""
+
+COSTR_BASE = replace(COSTR_SMALL, grid=BASE_GRID)
+"""The network of costr-small at OPV2V's full range: its weights are trained on from those of costr-small."""
 
 COSTR_OPV2V = DetectorConfig(
     grid=OPV2V_GRID,
@@ -53,4 +63,4 @@ COSTR_TINY = DetectorConfig(
 )
 """For tests and examples, trains in seconds."""
 
-DETECTORS = {"costr-small": COSTR_SMALL, "costr-opv2v": COSTR_OPV2V, "costr-tiny": COSTR_TINY}
+DETECTORS = {"costr-small": COSTR_SMALL, "costr-base": COSTR_BASE, "costr-opv2v": COSTR_OPV2V, "costr-tiny": COSTR_TINY}

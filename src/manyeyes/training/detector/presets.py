@@ -6,8 +6,18 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from manyeyes.models.detector.presets import COSTR_OPV2V, COSTR_SMALL, COSTR_TINY, SMALL_GRID, SMALL_SQUARE_GRID
+from manyeyes.datatypes import BevGrid
+from manyeyes.models.detector.presets import (
+    BASE_SQUARE_GRID,
+    COSTR_BASE,
+    COSTR_OPV2V,
+    COSTR_SMALL,
+    COSTR_TINY,
+    SMALL_GRID,
+    SMALL_SQUARE_GRID,
+)
 from manyeyes.training.detector.losses import LossConfig
+from manyeyes.training.detector.plan import TrainPlan
 from manyeyes.training.detector.samples import AugmentConfig, DegradationConfig
 from manyeyes.training.detector.task import DetectorTrainConfig
 
@@ -33,6 +43,8 @@ _FINAL = replace(
     augment=AugmentConfig(max_point_dropout=0.1, early_fusion_prob=0.2),
     loss=LossConfig(iou=0.8, fusion_weight=0.6, prune=1.0),
 )
+_SENSORS = replace(_FINAL, steps=4000, learning_rate=6e-4, warmup_steps=100, prune_warmup_end=0.001)
+"""Trains finished weights on over the mixture of sensors and intensity laws."""
 _BRANCH = replace(
     _FINAL,
     degradation=replace(_FINAL.degradation, sender_history=2),
@@ -51,6 +63,13 @@ def _branch(**changes: Any) -> DetectorTrainConfig:
 _FINE_ONLY = replace(COSTR_SMALL.encoder, use_coarse_strides=False, prune_strides=())
 _NO_BLOCKS = replace(COSTR_SMALL.dast, blocks=0)
 _PLAIN = {"dast": _NO_BLOCKS, "fusion": "max"}
+
+
+def _widen(config: DetectorTrainConfig, **changes: Any) -> DetectorTrainConfig:
+    """Return a stage at the range of costr-base, for weights that are trained at that of costr-small."""
+    grids = {"grid": BASE_SQUARE_GRID, "output_range": COSTR_BASE.grid}
+    return replace(config, detector=replace(config.detector, **grids), prune_warmup_end=0.001, **changes)
+
 
 DETECTOR_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {
     "costr-small/stage1": DetectorTrainConfig(
@@ -77,6 +96,8 @@ DETECTOR_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {
     ),
     "costr-small/stage3": _DEGRADED,
     "costr-small/stage4": _FINAL,
+    "costr-base/stage5": _widen(_DEGRADED, steps=3000, learning_rate=6e-4),
+    "costr-base/stage6": _widen(_FINAL, steps=4000, learning_rate=6e-4),
     "ablation/none": _branch(**_PLAIN, encoder=_FINE_ONLY),
     "ablation/se": _branch(**_PLAIN),
     "ablation/se-dast": _branch(fusion="max"),
@@ -96,8 +117,32 @@ DETECTOR_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {
         augment=AugmentConfig(max_agents=3),
     ),
 }
-"""costr-small/stage1 to stage4, each initialised with the weights of the stage before, give the shipped weights: stage2 adds the
-wider range, all agents and the IoU loss; stage3 adds history, delay, pose errors, packet loss and budgets; stage4 prunes more
-cells, object by object. ablation/*: rows of the ablation, each trained on from the shipped weights for the same number of steps.
-costr-opv2v: 80 + 10 epochs as in the paper. costr-tiny: tests and examples.
+"""costr-small/stage1 to stage4, each initialised with the weights of the stage before: stage2 adds the wider range, all agents
+and the IoU loss; stage3 adds history, delay, pose errors, packet loss and budgets; stage4 prunes more cells, object by object.
+costr-base/stage5 and stage6 go on at twice the range. ablation/*: rows of the ablation, each trained on from the shipped weights
+for the same number of steps. costr-opv2v: 80 + 10 epochs as in the paper. costr-tiny: tests and examples.
+"""
+
+
+def _stages(prefix: str, *names: str) -> tuple[tuple[str, DetectorTrainConfig], ...]:
+    return tuple((name, DETECTOR_TRAINING_PRESETS[f"{prefix}/{name}"]) for name in names)
+
+
+_SMALL_STAGES = _stages("costr-small", "stage1", "stage2", "stage3", "stage4")
+_WIDE_STAGES = _stages("costr-base", "stage5", "stage6")
+_SMALL_DECODE = replace(COSTR_SMALL.decode, iou_score_weight=0.7)
+_SMALL_RELEASED = replace(_FINAL.detector, grid=BevGrid(-102.4, -102.4, -5.0, 102.4, 102.4, 6.0), decode=_SMALL_DECODE)
+_BASE_RELEASED = replace(_WIDE_STAGES[-1][1].detector, decode=_SMALL_DECODE)
+
+DETECTOR_PLANS: dict[str, TrainPlan] = {
+    "costr-small": TrainPlan(_SMALL_STAGES, released=_SMALL_RELEASED),
+    "costr-small/sensors": TrainPlan((("sensors", _SENSORS),), released=_SMALL_RELEASED, start="costr-small"),
+    "costr-base": TrainPlan((*_SMALL_STAGES, *_WIDE_STAGES), released=_BASE_RELEASED),
+    "costr-base/wide": TrainPlan(_WIDE_STAGES, released=_BASE_RELEASED, start="costr-small"),
+    "costr-tiny/plan": TrainPlan(
+        tuple((f"stage{k}", DETECTOR_TRAINING_PRESETS["costr-tiny"]) for k in (1, 2)), codebook_frames=4
+    ),
+}
+"""From nothing to weights with a codebook. costr-small: its four stages. costr-base: those, then two at OPV2V's range.
+costr-small/sensors and costr-base/wide: the shipped costr-small, or given weights, trained on. costr-tiny/plan: tests.
 """

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from manyeyes.datasets.base import Recording, iter_eval_frames
+from manyeyes.datasets.mixed import draw_scenario
 from manyeyes.datatypes import BevGrid, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.training.detector.sensor_augmentation import SensorAugmentation, SensorAugmentConfig
@@ -349,10 +350,11 @@ class SampleStream:
     degradation: DegradationConfig = DegradationConfig()
 
     def draw(self, number: int) -> Sample:
-        """Draw the sample of this number: scenario, frame with the required history, and ego, all uniform."""
+        """Draw the sample of this number: scenario, frame with the required history, and ego, all uniform but for the
+        weights of a mixture.
+        """
         rng = keyed_generator("sample", self.seed, number)
-        scenarios = self.recording.scenarios
-        scenario = scenarios[int(rng.integers(len(scenarios)))]
+        scenario = draw_scenario(self.recording, rng)
         index = int(rng.integers(self.recording.length(scenario)))
         back = 1 + max(
             self.degradation.ego_history,

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training plans: stages in order, each initialised by the one before, then a codebook, then the weights that ship."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import KW_ONLY, asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch.distributed as dist
+
+from manyeyes.datasets.base import Recording, iter_eval_frames
+from manyeyes.datatypes import CheckpointError, ConfigError
+from manyeyes.models import checkpoint
+from manyeyes.models.detector.codebook import CodebookConfig
+from manyeyes.models.detector.detector import Detector, DetectorConfig
+from manyeyes.models.token_peaks import CARD_KEY
+from manyeyes.training.detector.codebook import fit_codebook
+from manyeyes.training.detector.task import DetectorTask, DetectorTrainConfig
+from manyeyes.training.trainer import Progress, Trainer
+
+WEIGHTS = "weights.safetensors"
+CODEBOOK = "codebook"
+"""Folder of the weights with a codebook, in that of the run."""
+
+
+@dataclass(frozen=True)
+class TrainPlan:
+    """What gives weights that ship, from nothing or from given weights.
+
+    Attributes:
+        stages: name and settings of each stage; stage k is trained with the seed of the plan plus k.
+        released: configuration of the weights that ship, with tensors of the same shapes; None for that of the last stage.
+        start: shipped weights that the first stage begins from where none are given; None for random ones.
+        codebook: settings of the codebook that is fitted after the last stage; None for no codebook.
+        codebook_frames: maximum number of evaluated frames that the codebook is fitted to, spread evenly.
+    """
+
+    stages: tuple[tuple[str, DetectorTrainConfig], ...]
+    _: KW_ONLY
+    released: DetectorConfig | None = None
+    start: str | None = None
+    codebook: CodebookConfig | None = CodebookConfig()
+    codebook_frames: int = 400
+
+    def __post_init__(self) -> None:
+        names = [name for name, _ in self.stages]
+        if not names or len(set(names)) < len(names) or CODEBOOK in names:
+            raise ConfigError(
+                f"TrainPlan.stages needs names of its own for each stage, none '{CODEBOOK}'; got {names}."
+            )
+
+    @property
+    def steps(self) -> int:
+        """Number of optimiser steps of all stages; epochs are not counted."""
+        return sum(config.steps for _, config in self.stages)
+
+    def change_stages(self, **changes: Any) -> TrainPlan:
+        """Return the plan with fields of every stage's settings replaced."""
+        return replace(self, stages=tuple((name, replace(config, **changes)) for name, config in self.stages))
+
+
+Report = Callable[[str, Progress], None]
+
+
+def _report_nothing(stage: str, progress: Progress) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class PlanRun:
+    """A run of a plan in a folder; a killed one, made and run again, ends with the same weights bit by bit.
+
+    The folder holds one folder a stage, as of :class:`manyeyes.training.trainer.Trainer`, the folder ``codebook`` and
+    weights.safetensors. Of a finished stage only its weights are needed, so that the rest of its folder may be deleted, and the
+    folders of equal stages of another plan may be copied. Hold the lock of the folder, as for one stage.
+
+    Attributes:
+        plan: what is trained.
+        recording: training samples.
+        seed: of the first stage.
+        folder: of the run.
+        start: weights file that the first stage begins from.
+    """
+
+    plan: TrainPlan
+    recording: Recording
+    seed: int
+    folder: Path
+    start: Path | None = None
+
+    def run(self, card: dict[str, Any] | None = None, report: Report = _report_nothing) -> Path:
+        """Run what is left of the plan; returns the file of the final weights.
+
+        Args:
+            card: additions to the model cards of all weights.
+            report: called at every step of a stage with its name.
+
+        Raises:
+            CheckpointError: a folder holds a stage of other settings, another seed or other initial weights.
+            KeyboardInterrupt: SIGINT or SIGTERM came; the state after the current step is saved.
+        """
+        card, weights, stages = card or {}, self.start, list[dict[str, Any]]()
+        for number, (name, _) in enumerate(self.plan.stages):
+            weights = self._run_stage(number, weights, card, report)
+            stages.append({"name": name, **_select_stage_facts(checkpoint.read_card(weights))})
+        assert weights is not None
+        final = self.folder / WEIGHTS
+        if not dist.is_initialized() or dist.get_rank() == 0:
+            summary = {"seed": self.seed, "steps": sum(stage["steps"] for stage in stages)}
+            summary |= {"train_seconds": sum(stage["train_seconds"] for stage in stages), "stages": stages}
+            last = self._fit_codebook(weights, {**card, **summary})
+            model, made = checkpoint.load(last), checkpoint.read_card(last)
+            checkpoint.save(model, final, made, half=True)
+        _wait_for_first()
+        return final
+
+    def _run_stage(self, number: int, start: Path | None, card: dict[str, Any], report: Report) -> Path:
+        """Run a stage unless its weights are there; returns them."""
+        name, config = self.plan.stages[number]
+        seed, folder = self.seed + number, self.folder / name
+        begun = "" if start is None else checkpoint.load(start).fingerprint.hex()
+        if (folder / WEIGHTS).exists():
+            _check_stage(folder / WEIGHTS, config, seed, begun)
+            return folder / WEIGHTS
+        trainer = Trainer(DetectorTask(config, self.recording, seed, start), folder)
+        weights = trainer.run({**card, "started_from": begun}, lambda progress: report(name, progress))
+        _wait_for_first()
+        return weights
+
+    def _fit_codebook(self, weights: Path, card: dict[str, Any]) -> Path:
+        """Write the weights under their released configuration, with a codebook where the plan has one; returns the file."""
+        plan, path = self.plan, self.folder / CODEBOOK / WEIGHTS
+        seed = self.seed + len(plan.stages)
+        trained = checkpoint.load(weights)
+        source = trained.fingerprint.hex()
+        config = replace(plan.released or trained.config, codebook=plan.codebook)
+        if path.exists():
+            fitted = checkpoint.read_card(path).get("codebook", {})
+            if (fitted.get("seed"), fitted.get("started_from")) == (seed, source) and checkpoint.load(
+                path
+            ).config == config:
+                return path
+        detector, tokens = with_config(trained, config), 0
+
+        def count(number: int) -> None:
+            nonlocal tokens
+            tokens = number
+
+        if plan.codebook is not None:
+            frames = sum(1 for _ in iter_eval_frames(self.recording))
+            stride = max(1, frames // plan.codebook_frames)
+            detector = fit_codebook(detector, self.recording, seed, plan.codebook, stride, count)
+        about = {"seed": seed, "tokens": tokens, "started_from": source}
+        peaks = checkpoint.read_card(weights)[CARD_KEY]
+        checkpoint.save(detector, path, {**card, CARD_KEY: peaks, "codebook": about}, half=True)
+        return path
+
+
+def with_config(detector: Detector, config: DetectorConfig) -> Detector:
+    """Return the detector with another configuration, whose tensors have the same shapes; its codebook stays."""
+    changed = Detector(replace(config, codebook=detector.config.codebook))
+    changed.load_state_dict(detector.state_dict())
+    changed.eval().requires_grad_(False)
+    changed.fingerprint, changed.token_peaks = checkpoint.fingerprint(changed), detector.token_peaks
+    return changed
+
+
+def _select_stage_facts(card: dict[str, Any]) -> dict[str, Any]:
+    return {
+        key: card[key]
+        for key in ("seed", "steps", "train_seconds", "started_from", "git_commit", "config")
+        if key in card
+    }
+
+
+def _check_stage(path: Path, config: DetectorTrainConfig, seed: int, begun: str) -> None:
+    """Refuse weights of a stage that do not belong to this run; fields that are newer than the weights have their defaults."""
+    card = checkpoint.read_card(path)
+    try:
+        stored = checkpoint.config_from_json(DetectorTrainConfig, json.dumps(card.get("config")))
+    except ConfigError:
+        stored = None
+    differing = [
+        what
+        for what, same in (
+            ("other settings", stored == checkpoint.config_from_json(DetectorTrainConfig, json.dumps(asdict(config)))),
+            ("another seed", card.get("seed") == seed),
+            ("other initial weights", card.get("started_from") == begun),
+        )
+        if not same
+    ]
+    if differing:
+        raise CheckpointError(
+            f"{path}: belongs to a stage with {' and '.join(differing)}; give another --out, or delete its folder."
+        )
+
+
+def _wait_for_first() -> None:
+    """Wait until the first process has written its files."""
+    if dist.is_initialized():
+        dist.barrier()
