@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from manyeyes.datasets.base import Recording, RecordingReader
+from manyeyes.datasets.deferred import read_deferred
 from manyeyes.datasets.missing import FileProblem
 from manyeyes.datasets.registry import open_recording
 from manyeyes.datatypes import ConfigError, RecordingError, Snapshot
@@ -61,6 +62,11 @@ class MixedRecording(RecordingReader):
         """Return all agents at one instant, under the scenario's name in the mixture."""
         recording, name = self._find(scenario)
         return replace(recording.snapshot(name, index), scenario=scenario)
+
+    def deferred_snapshot(self, scenario: str, index: int) -> Snapshot:
+        """Return the snapshot without pictures; clouds are read at their first use where their recording supports it."""
+        recording, name = self._find(scenario)
+        return replace(read_deferred(recording, name, index), scenario=scenario)
 
     def eval_indices(self, scenario: str) -> range:
         """Return the indices that evaluation counts."""

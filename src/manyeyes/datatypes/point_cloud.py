@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -46,7 +47,8 @@ class PointCloud:
         points = as_tensor(xyz, "PointCloud.xyz", torch.float32)
         if points.ndim != 2 or points.shape[1] != 3:
             raise ShapeError(f"PointCloud.of needs xyz (N, 3); got {tuple(points.shape)}: pass x, y, z columns alone.")
-        if not bool(torch.isfinite(points).all()):
+        # The sum is a cheap first check: where it is finite, every point is.
+        if not math.isfinite(float(points.sum())) and not bool(torch.isfinite(points).all()):
             bad = int((~torch.isfinite(points).all(-1)).sum())
             raise ShapeError(
                 f"{bad} of {points.shape[0]} points are NaN or infinite; drop them before building a PointCloud."
@@ -62,6 +64,9 @@ class PointCloud:
         return self.xyz.shape[0]
 
     def __getitem__(self, index: Tensor | slice) -> PointCloud:
+        if isinstance(index, Tensor) and index.dtype == torch.bool:
+            index = index.nonzero()[:, 0]  # once instead of for each field
+            return PointCloud(*(field.index_select(0, index) for field in (self.xyz, self.intensity, self.time_s)))
         return PointCloud(self.xyz[index], self.intensity[index], self.time_s[index])
 
     def transform(self, target_from_source: Transform) -> PointCloud:

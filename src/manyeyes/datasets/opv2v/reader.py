@@ -11,12 +11,15 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from manyeyes.datasets.base import RecordingReader, require_index
+from manyeyes.datasets.deferred import DeferredCloud
 from manyeyes.datasets.formats.cache import ArrayCache, default_cache_folder
 from manyeyes.datasets.formats.pcd import PcdCloud, read_pcd
 from manyeyes.datasets.ground_height import PLAUSIBLE_HEIGHT_M, estimate_sensor_height
@@ -92,6 +95,8 @@ class Opv2vRecording(RecordingReader):
             first = f"{problems[0]}{more}" if problems else "it is empty"
             raise RecordingError(f"{self.root}: expected whole scenarios; {first}. Download what is missing.")
         self._records: dict[Path, AgentRecord] = {}
+        self._poses: dict[tuple[Path, str], tuple[np.ndarray, np.ndarray, float]] = {}
+        self._lists: dict[tuple[str, int], _ListedVehicles] = {}
         self._protocols: dict[str, DataProtocol] = {}
         self._heights: dict[Path, float] = {}
 
@@ -111,11 +116,26 @@ class Opv2vRecording(RecordingReader):
         """Read all agents that have this frame; the truth is the union of what they list, in the order of ids."""
         return self._snapshot(scenario, index, self._with_images)
 
+    def deferred_snapshot(self, scenario: str, index: int) -> Snapshot:
+        """Return the snapshot without pictures; each cloud is read at its first use."""
+        stem, present = self._present(scenario, index)
+        frames = tuple(self._frame(scenario, agent, stem, False, is_deferred=True) for agent in present)
+        return Snapshot(scenario, index, frames, self._truth(scenario, index, frames))
+
     def _snapshot(self, scenario: str, index: int, images: bool) -> Snapshot:
         stem, present = self._present(scenario, index)
         frames = tuple(self._frame(scenario, agent, stem, images) for agent in present)
-        records = [self._record(agent.folder / f"{stem}.yaml") for agent in present]
-        return Snapshot(scenario, index, frames, _truth(frames, records))
+        return Snapshot(scenario, index, frames, self._truth(scenario, index, frames))
+
+    def _truth(self, scenario: str, index: int, frames: tuple[AgentFrame, ...]) -> GroundTruth:
+        """Return the truth of a snapshot's frames."""
+        if (scenario, index) not in self._lists:
+            stem, present = self._present(scenario, index)
+            records = [self._record(agent.folder / f"{stem}.yaml") for agent in present]
+            if len(self._lists) >= _MAX_CACHED_RECORDS:
+                self._lists.clear()
+            self._lists[scenario, index] = _merge_lists(records, [agent.id for agent in present])
+        return _truth(self._lists[scenario, index], frames)
 
     def present_agents(self, scenario: str, index: int) -> tuple[int, ...]:
         """Return the ids of the agents that have this frame, in the order of the snapshot's frames."""
@@ -190,18 +210,24 @@ class Opv2vRecording(RecordingReader):
     def _cloud(self, agent: AgentFiles, stem: str) -> PcdCloud:
         return read_pcd(agent.folder / f"{stem}.pcd", self._drop_nan, self._cache)
 
-    def _frame(self, scenario: str, agent: AgentFiles, stem: str, images: bool) -> AgentFrame:
-        record, cloud = self._record(agent.folder / f"{stem}.yaml"), self._cloud(agent, stem)
-        world_from_lidar = transform_from_carla(record.lidar_pose)
-        height = self._sensor_height(agent, record, world_from_lidar)
+    def _points(self, agent: AgentFiles, stem: str, height: float) -> PointCloud:
+        """Read the cloud of an agent in its frame."""
+        cloud = self._cloud(agent, stem)
         xyz = mirror_points(cloud.xyz)
         xyz[:, 2] += np.float32(height)
-        world_from_agent = world_from_lidar @ Transform.from_xyz_yaw(0, 0, -height)
+        return PointCloud.of(torch.from_numpy(xyz), torch.from_numpy(cloud.intensity))
+
+    def _frame(
+        self, scenario: str, agent: AgentFiles, stem: str, images: bool, is_deferred: bool = False
+    ) -> AgentFrame:
         yaml = agent.folder / f"{stem}.yaml"
+        record = self._record(yaml)
+        world_from_agent, height = self._pose(agent, stem)
+        read = partial(self._points, agent, stem, height)
         return AgentFrame(
             agent_id=agent.id,
             timestamp_ns=round(int(stem) * self._protocol(scenario).fixed_delta_s * 1e9),
-            points=PointCloud.of(torch.from_numpy(xyz), torch.from_numpy(cloud.intensity)),
+            points=DeferredCloud(read) if is_deferred else read(),
             world_from_agent=world_from_agent,
             pose_covariance=torch.zeros(3, 3, dtype=torch.float64),
             sensor_height_m=height,
@@ -209,6 +235,19 @@ class Opv2vRecording(RecordingReader):
             is_infrastructure=record.is_infrastructure,
             images=read_images(yaml, world_from_agent, self._cache) if images else (),
         )
+
+    def _pose(self, agent: AgentFiles, stem: str) -> tuple[Transform, float]:
+        """Return the pose of an agent's frame, and the height of its LiDAR above the road."""
+        if (agent.folder, stem) not in self._poses:
+            record = self._record(agent.folder / f"{stem}.yaml")
+            world_from_lidar = transform_from_carla(record.lidar_pose)
+            height = self._sensor_height(agent, record, world_from_lidar)
+            pose = world_from_lidar @ Transform.from_xyz_yaw(0, 0, -height)
+            if len(self._poses) >= _MAX_CACHED_RECORDS:
+                self._poses.clear()
+            self._poses[agent.folder, stem] = (pose.rotation.numpy(), pose.translation.numpy(), height)
+        rotation, translation, height = self._poses[agent.folder, stem]
+        return Transform(torch.from_numpy(rotation.copy()), torch.from_numpy(translation.copy())), height
 
     def _sensor_height(self, agent: AgentFiles, record: AgentRecord, world_from_lidar: Transform) -> float:
         """Return the metres from the road up to the LiDAR along the LiDAR's z axis.
@@ -234,22 +273,46 @@ def _stated_height(record: AgentRecord, world_from_lidar: Transform) -> float | 
     return height if low <= height <= high and float(offset.norm()) <= high else None
 
 
-def _truth(frames: tuple[AgentFrame, ...], records: list[AgentRecord]) -> GroundTruth:
-    """Return the union of all lists by id, first agent's copy, in the order of ids."""
-    listed = [np.where(r.id != f.agent_id)[0] for f, r in zip(frames, records)]
+@dataclass(frozen=True)
+class _ListedVehicles:
+    """The union of all agents' lists by id, first agent's copy, in the order of ids, as arrays of V vehicles.
+
+    seen: (agents, V). center: (V, 3), size: (V, 3), yaw, label, id: (V,), velocity: (V, 2), as in Boxes.
+    """
+
+    seen: np.ndarray
+    center: np.ndarray
+    size: np.ndarray
+    yaw: np.ndarray
+    label: np.ndarray
+    id: np.ndarray
+    velocity: np.ndarray
+
+
+def _merge_lists(records: list[AgentRecord], agent_ids: Sequence[int]) -> _ListedVehicles:
+    listed = [np.where(r.id != agent_id)[0] for agent_id, r in zip(agent_ids, records)]
     id = np.concatenate([r.id[rows] for r, rows in zip(records, listed)])
     _, first = np.unique(id, return_index=True)
     seen = np.stack([np.isin(id[first], r.id[rows]) for r, rows in zip(records, listed)])
 
-    def column(name: str) -> torch.Tensor:
-        return torch.from_numpy(np.concatenate([getattr(r, name)[rows] for r, rows in zip(records, listed)])[first])
+    def column(name: str) -> np.ndarray:
+        return np.concatenate([getattr(r, name)[rows] for r, rows in zip(records, listed)])[first]
 
     center = column("location") + column("center")
     center[:, 1] *= -1
-    yaw = -column("angle")[:, 1] * (math.pi / 180)
-    velocity = torch.stack((yaw.cos(), yaw.sin()), 1) * (column("speed") / KMH_PER_MPS)[:, None]
-    boxes = Boxes.of(center, 2 * column("extent"), yaw, None, column("label"), torch.from_numpy(id[first]), velocity)
-    return GroundTruth(boxes, torch.from_numpy(seen), Transform.stack([f.world_from_agent for f in frames]))
+    yaw = torch.from_numpy(-column("angle")[:, 1] * (math.pi / 180))
+    velocity = torch.stack((yaw.cos(), yaw.sin()), 1) * (torch.from_numpy(column("speed")) / KMH_PER_MPS)[:, None]
+    return _ListedVehicles(
+        seen, center, 2 * column("extent"), yaw.numpy(), column("label"), id[first], velocity.numpy()
+    )
+
+
+def _truth(listed: _ListedVehicles, frames: tuple[AgentFrame, ...]) -> GroundTruth:
+    """Return the truth with the poses of frames; every tensor is a copy."""
+    names = ("center", "size", "yaw", "label", "id", "velocity")
+    boxes = Boxes.of(**{name: torch.from_numpy(getattr(listed, name).copy()) for name in names})
+    seen = torch.from_numpy(listed.seen.copy())
+    return GroundTruth(boxes, seen, Transform.stack([f.world_from_agent for f in frames]))
 
 
 def _state(files: Sequence[Path], folder: Path) -> np.ndarray:

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from manyeyes.datasets.base import Recording, iter_eval_frames
+from manyeyes.datasets.deferred import read_deferred
 from manyeyes.datasets.mixed import draw_scenario
 from manyeyes.datatypes import BevGrid, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.ops.keyed_random import keyed_generator
@@ -228,6 +229,7 @@ class _AugmentedScene:
     ) -> None:
         self._moments, self._rng, self._config = moments, rng, config
         ids = tuple(frame.agent_id for frame in moments[-1].frames)
+        self._poses: dict[tuple[int, int], Transform] = {}
         self._turn = {
             agent_id: Transform.from_xyz_yaw(0, 0, 0, config.max_yaw_rad * rng.uniform(-1, 1)) for agent_id in ids
         }
@@ -249,7 +251,10 @@ class _AugmentedScene:
         row = self._row(back, agent_id)
         if row is None:
             return None
-        return self._moments[-1 - back].frames[row].world_from_agent @ self._turn[agent_id]
+        if (back, agent_id) not in self._poses:
+            pose = self._moments[-1 - back].frames[row].world_from_agent
+            self._poses[back, agent_id] = pose @ self._turn[agent_id]
+        return self._poses[back, agent_id]
 
     def cloud(self, back: int, agent_id: int) -> PointCloud | None:
         """Return the agent's sweep in its rotated frame at that time, with points dropped out."""
@@ -360,7 +365,7 @@ class SampleStream:
             self.degradation.ego_history,
             self.degradation.sender_history + (self.degradation.max_delay_frames if self.degradation.delay_prob else 0),
         )
-        moments = [self.recording.snapshot(scenario, i) for i in range(max(0, index - back), index + 1)]
+        moments = [read_deferred(self.recording, scenario, i) for i in range(max(0, index - back), index + 1)]
         ego = int(rng.integers(len(moments[-1].frames)))
         return make_sample(moments, ego, self.grid, self.augment, (self.seed, number), self.degradation)
 
