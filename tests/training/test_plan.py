@@ -127,6 +127,11 @@ def test_a_plan_begins_from_given_weights_and_refuses_those_of_another_run(toy, 
         PlanRun(plan, road(toy), 0, tmp_path / "run", tmp_path / "b.safetensors").run()
 
 
+@pytest.mark.parametrize("name", [name for name in TRAINING_PLANS if not name.startswith("costr-tiny")])
+def test_the_last_stages_of_plans_that_ship_mix_sensors(name):
+    assert all(config.augment.sensors is not None for _, config in TRAINING_PLANS[name].stages[-2:])
+
+
 def test_every_stage_has_a_name_of_its_own():
     for stages in ((), (("one", STAGE), ("one", LATER)), (("codebook", STAGE),)):
         with pytest.raises(ConfigError, match=r"TrainPlan\.stages needs names"):

@@ -19,6 +19,7 @@ from manyeyes.models.detector.presets import (
 from manyeyes.training.detector.losses import LossConfig
 from manyeyes.training.detector.plan import TrainPlan
 from manyeyes.training.detector.samples import AugmentConfig, DegradationConfig
+from manyeyes.training.detector.sensor_augmentation import SensorAugmentConfig
 from manyeyes.training.detector.task import DetectorTrainConfig
 
 _DEGRADED = DetectorTrainConfig(
@@ -43,7 +44,15 @@ _FINAL = replace(
     augment=AugmentConfig(max_point_dropout=0.1, early_fusion_prob=0.2),
     loss=LossConfig(iou=0.8, fusion_weight=0.6, prune=1.0),
 )
-_SENSORS = replace(_FINAL, steps=4000, learning_rate=6e-4, warmup_steps=100, prune_warmup_end=0.001)
+_MIXTURE = SensorAugmentConfig()
+
+
+def _mix_sensors(config: DetectorTrainConfig) -> DetectorTrainConfig:
+    """Return a stage whose samples have drawn sensors and intensity laws."""
+    return replace(config, augment=replace(config.augment, sensors=_MIXTURE))
+
+
+_SENSORS = replace(_mix_sensors(_FINAL), steps=4000, learning_rate=6e-4, warmup_steps=100, prune_warmup_end=0.001)
 """Trains finished weights on over the mixture of sensors and intensity laws."""
 _BRANCH = replace(
     _FINAL,
@@ -94,10 +103,10 @@ DETECTOR_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {
         augment=AugmentConfig(max_agents=99),
         loss=LossConfig(iou=0.5),
     ),
-    "costr-small/stage3": _DEGRADED,
-    "costr-small/stage4": _FINAL,
-    "costr-base/stage5": _widen(_DEGRADED, steps=3000, learning_rate=6e-4),
-    "costr-base/stage6": _widen(_FINAL, steps=4000, learning_rate=6e-4),
+    "costr-small/stage3": _mix_sensors(_DEGRADED),
+    "costr-small/stage4": _mix_sensors(_FINAL),
+    "costr-base/stage5": _widen(_mix_sensors(_DEGRADED), steps=3000, learning_rate=6e-4),
+    "costr-base/stage6": _widen(_mix_sensors(_FINAL), steps=4000, learning_rate=6e-4),
     "ablation/none": _branch(**_PLAIN, encoder=_FINE_ONLY),
     "ablation/se": _branch(**_PLAIN),
     "ablation/se-dast": _branch(fusion="max"),
@@ -118,9 +127,10 @@ DETECTOR_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {
     ),
 }
 """costr-small/stage1 to stage4, each initialised with the weights of the stage before: stage2 adds the wider range, all agents
-and the IoU loss; stage3 adds history, delay, pose errors, packet loss and budgets; stage4 prunes more cells, object by object.
-costr-base/stage5 and stage6 go on at twice the range. ablation/*: rows of the ablation, each trained on from the shipped weights
-for the same number of steps. costr-opv2v: 80 + 10 epochs as in the paper. costr-tiny: tests and examples.
+and the IoU loss; stage3 adds history, delay, pose errors, packet loss, budgets, and drawn sensors and intensity laws; stage4
+prunes more cells, object by object. costr-base/stage5 and stage6 go on at twice the range. ablation/*: rows of the ablation, each
+trained on from the shipped weights for the same number of steps. costr-opv2v: 80 + 10 epochs as in the paper. costr-tiny: tests
+and examples.
 """
 
 
