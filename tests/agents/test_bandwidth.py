@@ -93,7 +93,8 @@ def test_codebook_tokens_are_decoded_to_their_values_in_a_tenth_of_the_bytes(det
     sender = Agent(detector, token_encoding="codebook", budget_bytes=None)
     packets = sender.share(frames[1])
     (received,) = Agent(detector).perceive(frames[0], packets).received
-    tokens = sender.perception_cache.process(frames[1]).shared_tokens
+    cache = sender.perception_cache
+    tokens = cache.process(cache.level(frames[1]).levelled).shared_tokens
     assert torch.equal(received.message.tokens.sites.key, tokens.sites.key)
     book = detector.codebook
     assert torch.equal(received.message.tokens.features, book.decode(book.encode(tokens.features)))

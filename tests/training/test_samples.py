@@ -7,7 +7,8 @@ import math
 import pytest
 import torch
 
-from manyeyes.datatypes import BevGrid, Boxes, ConfigError, GroundTruth, Snapshot, Transform
+from manyeyes.agents.level_frame import move_frames
+from manyeyes.datatypes import BevGrid, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.training.detector.samples import (
     AgentView,
     AugmentConfig,
@@ -341,3 +342,21 @@ def test_no_degradation_changes_nothing(toy):
             None,
         )
     assert driven(toy(), TURN, DegradationConfig()).ego_history == ()
+
+
+def test_a_stream_levels_frames_as_agents_do(toy):
+    zero = torch.zeros((), dtype=torch.float64)
+    tilt = Transform.from_rpy(torch.zeros(3).double(), zero + 0.04, zero - 0.02, zero)
+
+    class Tilted(toy):
+        def snapshot(self, scenario: str, index: int) -> Snapshot:
+            rng = torch.Generator().manual_seed(index)
+            radius, angle = torch.rand(4000, generator=rng) * 45 + 3, torch.rand(4000, generator=rng) * 6.2832
+            ground = PointCloud.of(torch.stack((radius * angle.cos(), radius * angle.sin(), torch.zeros(4000)), 1))
+            snapshot = super().snapshot(scenario, index)
+            frames = [dataclasses.replace(f, points=PointCloud.cat([f.points, ground])) for f in snapshot.frames]
+            return move_frames(dataclasses.replace(snapshot, frames=tuple(frames)), [tilt] * len(frames))
+
+    for view in SampleStream(Tilted(frames=3), GRID, NONE, 1, LATE).draw(2).views:
+        assert float(view.cloud.xyz[-4000:, 2].abs().max()) < 0.1
+        assert inside(view.visible_boxes, view.cloud.xyz).min() >= 50

@@ -52,8 +52,8 @@ class Perception:
     """Result of one perception.
 
     boxes: in the agent's frame, by falling score. received: the fused messages by agent id, with their corrected poses.
-    corrections: one for each received message, where the agent corrects poses. rejected: senders whose content was excluded, wholly
-    or in part, with the reason.
+    corrections: one for each received message, where the agent corrects poses, between levelled frames. rejected: senders whose
+    content was excluded, wholly or in part, with the reason.
     """
 
     boxes: Boxes
@@ -128,6 +128,7 @@ class Agent:
         is sent; objects, points and the map are not limited, but reduce the bytes left for tokens. requests: received messages;
         those with a request map weight the tokens by the sender's lack of confidence there.
         """
+        frame = self.perception_cache.level(frame).levelled
         budget = min((b for b in (self.budget_bytes, budget_bytes) if b is not None), default=None)
         message = self._compose(frame, requests)
         if message is None:
@@ -180,6 +181,8 @@ class Agent:
         inbox: an Inbox that packets were pushed into, preferably the agent's own (``inbox``), or plain packets, which arrive at
         now_ns. now_ns: end of the latency budget, by default the time of the frame; ages of messages are relative to it.
         """
+        level = self.perception_cache.level(frame)
+        frame = level.levelled
         now_ns = frame.timestamp_ns if now_ns is None else now_ns
         if not isinstance(inbox, Inbox):
             packets, inbox = inbox, self.inbox()
@@ -201,7 +204,10 @@ class Agent:
         rejected = [
             rejection for rejection in rejected if rejection.reason != "pose" or rejection.agent_id not in fused
         ]
-        return replace(perception, rejected=(*rejected, *left_out, *failed))
+        boxes = perception.boxes
+        if level.levelled_from_agent is not None:
+            boxes = boxes.transform(level.levelled_from_agent.inverse())
+        return replace(perception, boxes=boxes, rejected=(*rejected, *left_out, *failed))
 
     def _check(
         self, frame: AgentFrame, reception: ReceivedMessage, now_ns: int, limits: ReceiverLimits

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from manyeyes.agents.level_frame import FrameLeveller
 from manyeyes.agents.velocity import DEFAULT_VELOCITY_CONFIG, PastDetections, VelocityConfig, estimate_velocities
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, SparseBev
 from manyeyes.models.detector.box_head import SPEED_UNIT, DecodeConfig, RawBoxes, decode
@@ -82,9 +83,9 @@ class PerceptionCache:
     """A detector and its outputs on the last frames of one agent. Frames are compared by identity.
 
     max_frames: number of cached frames; the cache is cleared when time decreases, stands still, or jumps. feature_cache: outputs by
-    agent and timestamp, shared by several replays of one recording, which read and extend it. last_fused: the last fused frame and
-    its fused tokens, for strategies that need them. velocity_config: of velocity estimation over those frames; None keeps the
-    velocities of the detector.
+    agent and timestamp, shared by several replays of one recording, which read and extend it. velocity_config: of velocity
+    estimation over those frames; None keeps the velocities of the detector. level: levels frames (``agents.level_frame``); all
+    other methods take levelled ones. last_fused: the last fused frame and its fused tokens, for strategies that need them.
     """
 
     def __init__(
@@ -99,6 +100,7 @@ class PerceptionCache:
         self._outputs: list[tuple[AgentFrame, AgentOutput]] = []
         self._merged: tuple[AgentFrame, PointCloud] | None = None
         self._sent: list[tuple[AgentFrame, SparseBev]] = []
+        self.level = FrameLeveller()
         self.last_fused: tuple[AgentFrame, SparseBev] | None = None
 
     @property

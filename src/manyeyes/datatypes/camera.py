@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -71,3 +71,8 @@ class CameraImage:
         expected = (3, self.camera.height, self.camera.width)
         if self.rgb.shape != expected or self.rgb.dtype != torch.uint8:
             raise ShapeError(f"CameraImage.rgb needs {expected} uint8; got {tuple(self.rgb.shape)} {self.rgb.dtype}.")
+
+    def moved(self, new_from_agent: Transform) -> CameraImage:
+        """Return the same picture in a new frame of the agent."""
+        camera = replace(self.camera, agent_from_camera=new_from_agent @ self.camera.agent_from_camera)
+        return replace(self, camera=camera)

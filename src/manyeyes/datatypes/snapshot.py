@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -79,6 +79,19 @@ class AgentFrame:
         """From the agent's own frame of an earlier instant to this one, by its odometry."""
         now, then = self.odometry or self.world_from_agent, earlier.odometry or earlier.world_from_agent
         return now.inverse() @ then
+
+    def moved(self, new_from_agent: Transform) -> AgentFrame:
+        """Return the same observation in a new frame of the agent: points, poses, cameras and the height of the LiDAR."""
+        agent_from_new = new_from_agent.double().inverse()
+        lidar = new_from_agent.apply(torch.tensor([[0.0, 0.0, self.sensor_height_m]], dtype=torch.float64))
+        return replace(
+            self,
+            points=self.points.transform(new_from_agent),
+            world_from_agent=self.world_from_agent @ agent_from_new,
+            sensor_height_m=float(lidar[0, 2]),
+            odometry=None if self.odometry is None else self.odometry @ agent_from_new,
+            images=tuple(image.moved(new_from_agent) for image in self.images),
+        )
 
 
 @dataclass(frozen=True)

@@ -54,12 +54,18 @@ def lowest_of_cells(
 @njit(cache=True, nogil=True)
 def count_cells(cell_m: float, max_range_m: float) -> int:  # pragma: no cover
     """Return the number of cells along an edge of the grid."""
-    return int(math.ceil(2.0 * max_range_m / cell_m))
+    return math.ceil(2.0 * max_range_m / cell_m)
 
 
 @njit(cache=True, nogil=True)
 def find_consensus(
-    places: F64x2, weight: F64x1, ranges: F64x1, tolerance: Tolerance, draws: F64x2, max_slope: float, below_factor: float
+    places: F64x2,
+    weight: F64x1,
+    ranges: F64x1,
+    tolerance: Tolerance,
+    draws: F64x2,
+    max_slope: float,
+    below_factor: float,
 ) -> F64x1:  # pragma: no cover
     """Return the plane (slope along x, slope along y, height at the origin) of the maximum score, of the plane z = 0 and of those
     through the places (K, 3) that each row of draws (H, 3) in [0, 1) selects.

@@ -12,7 +12,7 @@ Weights fall with the range, so that each ring counts the same: a road is a plan
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from functools import cache
 
@@ -40,7 +40,8 @@ class GroundStatus(Enum):
 
     FOUND: a plane that differs from z = 0. LEVEL: z = 0 within the dead zone or within the noise of the fit. FEW_POINTS: too few
     candidates, or too few of them on one plane. ILL_CONDITIONED: the visible ground does not determine the slope, as between
-    walls. STEEP: the plane is too steep or too far from z = 0. UNEVEN: the road under the sensor lies on z = 0, not on the plane, as on a crest.
+    walls. STEEP: the plane is too steep or too far from z = 0. UNEVEN: the road under the sensor lies on z = 0 and not on the
+    plane, as on a crest.
     """
 
     FOUND = "found"
@@ -201,7 +202,7 @@ def _covariance(places: Floats, weight: Floats, plane: Floats) -> Floats:
 
 
 def _near_support(lowest: Floats, plane: Floats, config: GroundPlaneConfig) -> float:
-    """Return the number of candidates within near_range_m that a plane supports, each with a weight that falls with its distance."""
+    """Return the number of candidates within near_range_m that a plane supports, weighted by their distance from it."""
     near = lowest[np.hypot(lowest[:, 0], lowest[:, 1]) < config.near_range_m]
     distance = (near[:, 2] - near[:, :2] @ plane[:2] - plane[2]) / _NEAR_TOLERANCE_M
     return float(np.clip(1.0 - distance**2, 0.0, None).sum())

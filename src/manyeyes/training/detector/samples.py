@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 import torch
 
+from manyeyes.agents.level_frame import SnapshotLeveller
 from manyeyes.datasets.base import Recording, iter_eval_frames
 from manyeyes.datasets.deferred import read_deferred
 from manyeyes.datasets.mixed import draw_scenario
@@ -139,14 +140,16 @@ def make_sample(
     config: AugmentConfig,
     key: tuple[int | str, ...],
     degradation: DegradationConfig | None = None,
+    leveller: SnapshotLeveller | None = None,
 ) -> Sample:
     """Make the sample of this ego, a row of the last snapshot; key determines every random choice.
 
     snapshots: consecutive snapshots, oldest first; the last is the current one. Too few of them shorten the history.
+    leveller: levels the frames that are used; None for frames that are level.
     """
     degradation = degradation or DegradationConfig()
     rng = keyed_generator("augment", *key)
-    scene = _AugmentedScene(snapshots, rng, config, key)
+    scene = _AugmentedScene(snapshots, rng, config, key, leveller)
     now = snapshots[-1]
     chosen = _choose_agents(len(now.frames), ego, config.max_agents, rng)
     ids = [now.frames[i].agent_id for i in chosen]
@@ -222,12 +225,17 @@ def _degraded_views(
 
 
 class _AugmentedScene:
-    """The snapshots of one sample, with every agent's frame rotated by its own angle."""
+    """The snapshots of one sample, with every agent's frame levelled, and rotated by its own angle."""
 
     def __init__(
-        self, moments: Sequence[Snapshot], rng: np.random.Generator, config: AugmentConfig, key: tuple[int | str, ...]
+        self,
+        moments: Sequence[Snapshot],
+        rng: np.random.Generator,
+        config: AugmentConfig,
+        key: tuple[int | str, ...],
+        leveller: SnapshotLeveller | None,
     ) -> None:
-        self._moments, self._rng, self._config = moments, rng, config
+        self._moments, self._rng, self._config, self._leveller = moments, rng, config, leveller
         ids = tuple(frame.agent_id for frame in moments[-1].frames)
         self._poses: dict[tuple[int, int], Transform] = {}
         self._turn = {
@@ -253,8 +261,16 @@ class _AugmentedScene:
             return None
         if (back, agent_id) not in self._poses:
             pose = self._moments[-1 - back].frames[row].world_from_agent
-            self._poses[back, agent_id] = pose @ self._turn[agent_id]
+            self._poses[back, agent_id] = pose @ self._agent_from_view(back, row)
         return self._poses[back, agent_id]
+
+    def _agent_from_view(self, back: int, row: int) -> Transform:
+        """Return the motion from the levelled and rotated frame of an agent to its frame in the recording."""
+        snapshot = self._moments[-1 - back]
+        frame = snapshot.frames[row]
+        levelled_from_agent = None if self._leveller is None else self._leveller.find(snapshot, frame)
+        turn = self._turn[frame.agent_id]
+        return turn if levelled_from_agent is None else levelled_from_agent.inverse() @ turn
 
     def cloud(self, back: int, agent_id: int) -> PointCloud | None:
         """Return the agent's sweep in its rotated frame at that time, with points dropped out."""
@@ -263,7 +279,7 @@ class _AugmentedScene:
             return None
         frame = self._moments[-1 - back].frames[row]
         points = frame.points if self._sensors is None else self._sensors.points(frame)
-        cloud = points.transform(self._turn[agent_id].inverse())
+        cloud = points.transform(self._agent_from_view(back, row).inverse())
         if self._config.max_point_dropout:
             thin = self._config.max_point_dropout * self._rng.random()
             cloud = cloud[torch.from_numpy(self._rng.random(len(cloud)) >= thin)]
@@ -279,7 +295,7 @@ class _AugmentedScene:
         assert pose is not None
         assert now is not None
         truth = _truth(snapshot)
-        true = truth.world_from_agent[row] @ self._turn[agent_id]
+        true = truth.world_from_agent[row] @ self._agent_from_view(back, row)
         seen = truth.boxes[truth.seen[row] & (truth.boxes.id != agent_id)].transform(true.inverse())
         age_s = (self._moments[-1].frames[0].timestamp_ns - snapshot.frames[0].timestamp_ns) / 1e9
         return AgentView(
@@ -346,13 +362,14 @@ def _resize_boxes(boxes: Boxes, scale: float, flip: bool) -> Boxes:
 
 @dataclass(frozen=True)
 class SampleStream:
-    """An endless, keyed stream: sample i of a run does not depend on the number of processes."""
+    """An endless, keyed stream: sample i of a run does not depend on the number of processes. Frames are levelled, as by agents."""
 
     recording: Recording
     grid: BevGrid
     augment: AugmentConfig
     seed: int
     degradation: DegradationConfig = DegradationConfig()
+    _leveller: SnapshotLeveller = field(default_factory=SnapshotLeveller, repr=False, compare=False)
 
     def draw(self, number: int) -> Sample:
         """Draw the sample of this number: scenario, frame with the required history, and ego, all uniform but for the
@@ -367,7 +384,7 @@ class SampleStream:
         )
         moments = [read_deferred(self.recording, scenario, i) for i in range(max(0, index - back), index + 1)]
         ego = int(rng.integers(len(moments[-1].frames)))
-        return make_sample(moments, ego, self.grid, self.augment, (self.seed, number), self.degradation)
+        return make_sample(moments, ego, self.grid, self.augment, (self.seed, number), self.degradation, self._leveller)
 
 
 def epoch_length(recording: Recording) -> int:
