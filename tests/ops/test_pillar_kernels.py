@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, PointCloud, SparseBev
-from manyeyes.ops._pillar_kernels import pillar_maxima
-from manyeyes.ops.voxelize import pillar_sites, segment_max, segment_mean
+from manyeyes.ops._pillar_kernels import cloud_moments, pillar_maxima
+from manyeyes.ops.voxelize import MOMENTS, pillar_moments, pillar_sites, segment_max, segment_mean
 
 GRID = BevGrid(-4.0, -2.0, -1.0, 4.0, 2.0, 2.0)
 
@@ -61,3 +61,30 @@ def test_no_points_in_range_no_pillars() -> None:
     for clouds in ([far], [PointCloud.of(torch.zeros(0, 3))] * 2):
         out = pillar_maxima(clouds, [], GRID, torch.ones(4, 11), torch.ones(4))
         assert out.features.shape == (0, 4) and out.sites.batch_size == len(clouds)
+
+
+@pytest.mark.parametrize("agents", (1, 3))
+@pytest.mark.parametrize("sweeps", (1, 2))
+def test_moments_of_clouds_equal_those_of_points_in_range(agents: int, sweeps: int) -> None:
+    now = [cloud(700, seed) for seed in range(agents)]
+    before = [cloud(400, 9 + seed) for seed in range(agents)] if sweeps == 2 else []
+    clouds = [*now, *before]
+    xyz, bright = (torch.cat([getattr(c, name) for c in clouds]) for name in ("xyz", "intensity"))
+    agent = torch.cat([torch.full((len(c),), i % agents) for i, c in enumerate(clouds)])
+    pillars = pillar_sites(xyz, agent, GRID, agents)
+    is_old = (torch.arange(len(xyz)) >= sum(map(len, now)))[pillars.inside]
+    xyz, bright = xyz[pillars.inside], bright[pillars.inside]
+    parts = (~is_old, is_old)[:sweeps]
+    wanted = torch.cat([pillar_moments(xyz[s], bright[s], pillars.row[s], pillars.sites) for s in parts], 1)
+    got = cloud_moments(now, before, GRID, sweeps)
+    assert torch.equal(got.sites.key, pillars.sites.key) and got.sites.batch_size == agents
+    assert got.features.shape == (len(pillars.sites), sweeps * len(MOMENTS)) and not got.features.requires_grad
+    assert torch.allclose(got.features, wanted, rtol=1e-5, atol=1e-5)
+    if sweeps == 2:
+        only_now = (wanted[:, 12] == 0).nonzero()[:, 0]
+        assert len(only_now) and not got.features[only_now, 12:].any()
+
+
+def test_moments_of_no_points() -> None:
+    far = PointCloud.of(torch.tensor([[100.0, 0.0, 0.0]]))
+    assert cloud_moments([far, far], [], GRID, 2).features.shape == (0, 24)

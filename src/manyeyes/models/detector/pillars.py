@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, PointCloud, SparseBev
 from manyeyes.models.detector.layers import ActiveNorm, fold_norm
-from manyeyes.ops._pillar_kernels import pillar_maxima
+from manyeyes.ops._pillar_kernels import cloud_moments, pillar_maxima
 from manyeyes.ops.voxelize import Pillars, pillar_moments, pillar_sites, segment_max, segment_mean
 
 PillarKind = Literal["points", "moments"]
@@ -67,6 +67,10 @@ class MomentPillars(nn.Module):
         """Encode points (P, 3), their intensities (P,) and is_previous (P,) bool to (N, channels)."""
         sweeps = (~is_previous, is_previous) if self.sweeps == 2 else (slice(None),)
         moments = torch.cat([pillar_moments(xyz[s], intensities[s], pillars.row[s], pillars.sites) for s in sweeps], 1)
+        return self.encode(moments)
+
+    def encode(self, moments: Tensor) -> Tensor:
+        """Encode moments (N, NUM_MOMENTS * sweeps) to (N, channels)."""
         return torch.relu(self.norm(self.layers(self.scale(moments))))
 
 
@@ -88,6 +92,9 @@ class PillarEncoder(nn.Module):
         many, agents = [*clouds, *before], [*range(len(clouds)), *range(len(before))]
         if isinstance(self.net, PointPillars) and not self.training and not torch.is_grad_enabled() and _plain(many):
             return self.net.infer(clouds, before, self.grid)
+        if isinstance(self.net, MomentPillars) and _plain(many):
+            moments = cloud_moments(clouds, before, self.grid, self.sweeps)
+            return moments.with_features(self.net.encode(moments.features))
         xyz, intensities = (
             _concatenate([cloud.xyz for cloud in many]),
             _concatenate([cloud.intensity for cloud in many]),
