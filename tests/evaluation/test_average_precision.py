@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from manyeyes.datatypes import (
+    CLASSES,
+    LABELS,
     AgentFrame,
     Boxes,
     ConfigError,
@@ -326,6 +328,22 @@ def test_truth_respects_range_and_points():
     assert select_ego_truth(crossing(), 0, replace(GLOBAL_SORT, min_points_in_gt=2)).id.tolist() == [1, 2]
     assert select_ego_truth(crossing(), 0, replace(GLOBAL_SORT, min_points_in_gt=3)).id.tolist() == [2]
     assert select_ego_truth(crossing(), 0, replace(GLOBAL_SORT, min_points_in_gt=9)).id.tolist() == []
+
+
+def test_boxes_of_other_classes_are_neither_truth_nor_detections():
+    """Two cars and a pedestrian; the pedestrian is found where it stands, and once beside a car."""
+    scene = crossing()
+    truth = replace(scene.truth.boxes, label=torch.full_like(scene.truth.boxes.label, LABELS.index("pedestrian")))
+    walking = replace(scene, truth=replace(scene.truth, boxes=truth))
+    assert len(select_ego_truth(walking, 0, GLOBAL_SORT)) == 0
+    pedestrians = replace(GLOBAL_SORT, classes=("pedestrian",))
+    assert select_ego_truth(walking, 0, pedestrians).id.tolist() == select_ego_truth(scene, 0, GLOBAL_SORT).id.tolist()
+    both = cars((0, 0, 0.9), (20, 0, 0.8), (10, 0, 0.7))
+    both = replace(both, label=torch.tensor([0, 3, LABELS.index("pedestrian")]))
+    frame = FrameResult("s", 0, both, both)
+    for protocol, count in ((GLOBAL_SORT, 2), (pedestrians, 1), (replace(GLOBAL_SORT, classes=CLASSES), 3)):
+        result = average_precision([frame], 0.5, protocol)
+        assert (result.n_gt, result.n_detections, result.ap) == (count, count, 1.0)
 
 
 def test_a_snapshot_without_truth_is_refused():

@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from manyeyes.datatypes import LABELS, BevGrid, Boxes, Sites, SparseBev
+from manyeyes.datatypes import VEHICLE_LABELS, BevGrid, Boxes, Sites, SparseBev
 from manyeyes.models.detector.box_head import SPEED_UNIT, TYPICAL_SIZE, WIDTHS, BoxHead, DecodeConfig, RawBoxes, decode
 from manyeyes.ops.box_iou import pairwise_iou
 from manyeyes.training.detector.targets import TargetConfig, assign_targets
@@ -26,7 +26,7 @@ def some_boxes(n: int = 6, seed: int = 0) -> Boxes:
     size = torch.tensor(TYPICAL_SIZE) * (0.8 + 0.6 * torch.rand(n, 3, generator=random))
     yaw = torch.rand(n, generator=random) * 2 * math.pi - math.pi
     velocity = 12 * torch.randn(n, 2, generator=random)
-    return Boxes.of(center, size, yaw, label=torch.arange(n) % len(LABELS), velocity=velocity)
+    return Boxes.of(center, size, yaw, label=torch.arange(n) % len(VEHICLE_LABELS), velocity=velocity)
 
 
 def encode(boxes: Boxes, sites: Sites) -> RawBoxes:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from hypothesis import given, strategies as st
 
-from manyeyes.datatypes import LABELS, BevGrid, ConfigError, ShapeError, Sites
+from manyeyes.datatypes import VEHICLE_LABELS, BevGrid, ConfigError, ShapeError, Sites
 from manyeyes.models.detector.box_head import BOX_LAYOUT, DecodeConfig, RawBoxes, axis_yaw, decode, heading_logit
 from manyeyes.models.detector.codebook import FREQUENCY_TOTAL, Codebook, CodebookConfig, nearest_centre, residual_codes
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, make_proposals, move_proposal
@@ -34,7 +34,7 @@ def proposals(seed: int, count: int = 200) -> torch.Tensor:
     rows[:, BOX_LAYOUT.log_size] = uniform(-1, 1, 3)
     rows[:, BOX_LAYOUT.axis] = torch.stack(((2 * yaw).cos(), (2 * yaw).sin()), 1)
     rows[:, BOX_LAYOUT.direction] = uniform(0.2, 10) * torch.stack((yaw.cos(), yaw.sin()), 1)
-    rows[:, BOX_LAYOUT.class_logits] = uniform(-6, 6, len(LABELS))
+    rows[:, BOX_LAYOUT.class_logits] = uniform(-6, 6, len(VEHICLE_LABELS))
     rows[:, BOX_LAYOUT.log_sigma_xy], rows[:, BOX_LAYOUT.log_sigma_yaw] = uniform(-3.9, 1.9), uniform(-3.9, 1.9)
     rows[:, BOX_LAYOUT.iou_logit], rows[:, BOX_LAYOUT.velocity] = uniform(-5, 5), uniform(-3, 3, 2)
     return rows

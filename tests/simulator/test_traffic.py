@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from manyeyes.datatypes import LABELS, ConfigError, MissingExtraError, ShapeError
+from manyeyes.datatypes import VEHICLE_LABELS, ConfigError, MissingExtraError, ShapeError
 from manyeyes.simulator.scene import traffic
 from manyeyes.simulator.scene.parking import parked_cars
 from manyeyes.simulator.scene.towns import load_town
@@ -116,7 +116,7 @@ def test_nonsense_is_refused(town):
 
 def test_sizes_and_shares():
     kind, size = draw_vehicles(np.random.default_rng(0), 4000)
-    share = np.bincount(kind, minlength=len(LABELS)) / 4000
+    share = np.bincount(kind, minlength=len(VEHICLE_LABELS)) / 4000
     np.testing.assert_allclose(share, [0.78, 0.10, 0.07, 0.05], atol=0.02)
     cars = size[kind == 0]
     assert (cars.min(0) >= [3.6, 1.7, 1.35]).all()

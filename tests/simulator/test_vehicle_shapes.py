@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import torch
 
-from manyeyes.datatypes import LABELS, Boxes, ConfigError, Transform
+from manyeyes.datatypes import VEHICLE_LABELS, Boxes, ConfigError, Transform
 from manyeyes.simulator.scene.vehicle_shapes import (
     box_centers,
     make_vehicle_shape,
@@ -14,7 +14,7 @@ from manyeyes.simulator.scene.vehicle_shapes import (
 SIZES = {"car": (4.4, 1.8, 1.5), "van": (5.6, 2.0, 2.3), "truck": (8.5, 2.5, 3.3), "bus": (12.0, 2.55, 3.2)}
 
 
-@pytest.mark.parametrize("kind", LABELS)
+@pytest.mark.parametrize("kind", VEHICLE_LABELS)
 def test_every_part_lies_in_the_box_and_the_parts_reach_its_sides(kind: str) -> None:
     for id in range(60):
         body = make_vehicle_shape(kind, SIZES[kind], 3, id)

@@ -191,6 +191,7 @@ def _evaluate(estimate: PoseEstimate, snapshot: Snapshot, row: int) -> PoseEvalu
     truth = snapshot.truth
     if truth is None:
         return None
+    truth = truth.of_classes()
     ego_from_world = truth.world_from_agent[0].inverse()
     both = truth.boxes.center[truth.seen[0] & truth.seen[row]].double()
     common = ego_from_world.apply(both)[:, :2].numpy()

@@ -29,7 +29,7 @@ TokenEncoding = Literal["float32", "float16", "int8", "codebook"]
 
 TOKEN_ENCODINGS: tuple[TokenEncoding, ...] = ("float32", "float16", "int8", "codebook")
 # The middle of what drives in European cities.
-LABEL_HEIGHTS = (1.6, 2.3, 3.2, 3.2)
+LABEL_HEIGHTS = (1.6, 2.3, 3.2, 3.2, 1.7, 1.7, 1.6)
 NONE, TOKENS, OBJECTS, POINTS, REQUEST, ELEMENTS = range(6)
 
 _GRID = struct.Struct("<6hHB")

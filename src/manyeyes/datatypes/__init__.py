@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING
 from manyeyes._lazy import attach
 
 if TYPE_CHECKING:
-    from manyeyes.datatypes.boxes import LABELS as LABELS, Boxes as Boxes, wrap_angle as wrap_angle
+    from manyeyes.datatypes.boxes import (
+        CLASSES as CLASSES,
+        LABELS as LABELS,
+        VEHICLE_LABELS as VEHICLE_LABELS,
+        VEHICLES as VEHICLES,
+        Boxes as Boxes,
+        wrap_angle as wrap_angle,
+    )
     from manyeyes.datatypes.camera import Camera as Camera, CameraImage as CameraImage
     from manyeyes.datatypes.errors import (
         CheckpointError as CheckpointError,

@@ -4,16 +4,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
 
-from manyeyes.datatypes.errors import ShapeError
+from manyeyes.datatypes.errors import ConfigError, ShapeError
 from manyeyes.datatypes.numbers import Numbers, as_tensor
 from manyeyes.datatypes.transform import Transform
 
-LABELS = ("car", "van", "truck", "bus")
+VEHICLE_LABELS = ("car", "van", "truck", "bus")
+LABELS = (*VEHICLE_LABELS, "pedestrian", "cyclist", "motorcyclist")
+CLASSES = ("vehicle", "pedestrian", "cyclist")
+"""What is detected and evaluated together: all of VEHICLE_LABELS; pedestrians; cyclists and motorcyclists."""
+VEHICLES = ("vehicle",)
+_CLASS_OF_LABEL = (0, 0, 0, 0, 1, 2, 2)
 
 
 @dataclass(frozen=True)
@@ -117,6 +123,22 @@ class Boxes:
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         values |= {"center": target_from_source.apply(self.center), "yaw": torch.atan2(ahead[:, 1], ahead[:, 0])}
         return Boxes(**(values | {"velocity": velocity}))
+
+    def class_rows(self, classes: Sequence[str] = VEHICLES) -> Tensor:
+        """Return (N,) int64: the position of each box's class in the list, -1 where it is of no listed class.
+
+        Raises:
+            ConfigError: a name is none of CLASSES.
+        """
+        unknown = [name for name in classes if name not in CLASSES]
+        if unknown:
+            raise ConfigError(f"No class of objects is called {unknown[0]!r}; known: {', '.join(CLASSES)}.")
+        row = [classes.index(CLASSES[kind]) if CLASSES[kind] in classes else -1 for kind in _CLASS_OF_LABEL]
+        return torch.tensor(row)[self.label]
+
+    def of_classes(self, classes: Sequence[str] = VEHICLES) -> Boxes:
+        """Return the boxes of the listed classes."""
+        return self[self.class_rows(classes) >= 0]
 
     def after(self, seconds: float) -> Boxes:
         """Where the boxes are so much later, if each keeps its velocity."""

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from manyeyes.datatypes.boxes import Boxes
+from manyeyes.datatypes.boxes import VEHICLES, Boxes
 from manyeyes.datatypes.camera import CameraImage
 from manyeyes.datatypes.errors import ShapeError
 from manyeyes.datatypes.numbers import Numbers, as_tensor
@@ -118,6 +119,11 @@ class GroundTruth:
         poses = world_from_agent if isinstance(world_from_agent, Transform) else Transform.from_matrix(world_from_agent)
         listed = torch.ones(*poses.translation.shape[:-1], len(boxes)) if seen is None else seen
         return cls(boxes.to(torch.float64), as_tensor(listed, "GroundTruth.seen", torch.bool), poses.double())
+
+    def of_classes(self, classes: Sequence[str] = VEHICLES) -> GroundTruth:
+        """Return the truth of the boxes of the listed classes alone."""
+        rows = self.boxes.class_rows(classes) >= 0
+        return self if bool(rows.all()) else GroundTruth(self.boxes[rows], self.seen[:, rows], self.world_from_agent)
 
     def __post_init__(self) -> None:
         agents = tuple(self.world_from_agent.translation.shape[:-1])

@@ -90,9 +90,10 @@ def make_scene(snapshot: Snapshot, detections: Boxes, ego: int = 0, missing_ids:
     if snapshot.truth is None:
         return BirdsEyeScene(tuple(agents), Boxes.empty(), torch.zeros(0, dtype=torch.bool), detections)
     # The ego's own box is not evaluated: its marker stands for it.
-    others = snapshot.truth.boxes.id != snapshot.frames[ego].agent_id
-    true_boxes = snapshot.truth.boxes[others].transform(snapshot.truth.world_from_agent[ego].inverse())
-    return BirdsEyeScene(tuple(agents), true_boxes, snapshot.truth.seen.any(0)[others], detections)
+    truth = snapshot.truth.of_classes()
+    others = truth.boxes.id != snapshot.frames[ego].agent_id
+    true_boxes = truth.boxes[others].transform(truth.world_from_agent[ego].inverse())
+    return BirdsEyeScene(tuple(agents), true_boxes, truth.seen.any(0)[others], detections)
 
 
 def make_viewport(grid: BevGrid, width: int = 1280, margin_m: float = 4.0) -> Viewport:

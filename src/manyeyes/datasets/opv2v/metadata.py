@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OPV2V's metadata: one agent's yaml of one instant, and the scenario's data_protocol.yaml."""
+"""Metadata in OPV2V's layout: one agent's yaml of one instant, and the scenario's data_protocol.yaml."""
 
 from __future__ import annotations
 
@@ -11,34 +11,20 @@ from typing import Any
 import numpy as np
 import yaml
 
-from manyeyes._io import MAX_TEXT_BYTES, atomic_write_text, read_file
+from manyeyes._io import atomic_write_text
 from manyeyes.datasets.formats.cache import ArrayCache
+from manyeyes.datasets.formats.yaml_file import REMEDY as _REMEDY, load_yaml
+from manyeyes.datasets.opv2v.dialect import find_label, pose_of_matrix
 from manyeyes.datatypes import LABELS, RecordingError
 from manyeyes.datatypes.errors import shorten
 
-_MAX_MERGED, _MAX_MERGED_ENTRIES = 100, 10_000
-
-
-class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # pyright: ignore[reportGeneralTypeIssues]
-    """Safe loader with a bound on merge keys (<<), which copy what they name: nested ones grow exponentially."""
-
-    num_merged = 0
-
-    def flatten_mapping(self, node: yaml.MappingNode) -> None:
-        """Merge as yaml 1.1 does, up to the bound."""
-        merged = [value for key, value in node.value if key.tag == "tag:yaml.org,2002:merge"]
-        num_sources = sum(len(value.value) if isinstance(value, yaml.SequenceNode) else 1 for value in merged)
-        if num_sources <= _MAX_MERGED:
-            super().flatten_mapping(node)
-            self.num_merged += len(node.value) if merged else 0
-        if num_sources > _MAX_MERGED or self.num_merged > _MAX_MERGED_ENTRIES:
-            raise yaml.YAMLError(f"'<<' merges more than {_MAX_MERGED} mappings or {_MAX_MERGED_ENTRIES:,} entries")
-
-
 KMH_PER_MPS = 3.6
-_REMEDY = "copy or download the file again"
-# Columns of a kept array: row 0 is the agent, the rows below are the vehicles that it lists.
-_COLUMNS = 16
+PROTOCOL = "data_protocol.yaml"
+"""Name of the file in a scenario's folder that says how it was simulated."""
+# Columns of a kept array: row 0 is the agent, the rows below are the objects that it lists.
+_COLUMNS, _CACHE_KIND = 16, "opv2v2"
+# Published matrices are rounded; a mirrored or sheared one is farther off than this.
+_NOT_A_ROTATION = 0.02
 _MAX_ID = 2**53
 _MAX_DELTA_S, _MAX_HISTORY_FRAMES = 3600.0, 1_000_000
 _VANS = ("sprinter", "t2", "ambulance")
@@ -48,10 +34,13 @@ _BUSES = ("fusorosa", "bus")
 
 @dataclass(frozen=True)
 class AgentRecord:
-    """Content of one yaml in its own units: metres, degrees and km/h in CARLA's left-handed world.
+    """Content of one yaml in its own units and axes: metres, degrees and km/h, in OPV2V in CARLA's left-handed world.
 
-    lidar_pose, ego_pose, predicted_pose: [x, y, z, roll, yaw, pitch]; ego_pose is NaN where the file has none.
-    id, label: (N,) of the listed vehicles; location, center, extent, angle ([roll, yaw, pitch]): (N, 3); speed: (N,).
+    lidar_pose, ego_pose, predicted_pose: [x, y, z, roll, yaw, pitch]; ego_pose is NaN where the file has none. id, label: (N,) of
+    the listed objects, label -1 where the stated type is none of LABELS; location, center, extent, angle ([roll, yaw, pitch]):
+    (N, 3); speed: (N,); link: (N,), the ``ass_id`` that links an object of several lists, -1 for none. has_matrix:
+    lidar_pose stood as a 4x4 matrix. has_links: some object has an ``ass_id``, also -1. has_named_types: some type is capitalised,
+    as those of real recordings are.
     """
 
     lidar_pose: tuple[float, ...]
@@ -65,6 +54,10 @@ class AgentRecord:
     extent: np.ndarray
     angle: np.ndarray
     speed: np.ndarray
+    link: np.ndarray
+    has_matrix: bool
+    has_links: bool
+    has_named_types: bool
 
 
 @dataclass(frozen=True)
@@ -75,23 +68,9 @@ class DataProtocol:
     history_frames: int = 0
 
 
-def load_yaml(path: Path) -> Mapping[Any, Any]:
-    """Return the mapping at the top of a yaml file; anchors and aliases are resolved."""
-    try:
-        content = yaml.load(read_file(path, MAX_TEXT_BYTES), _Loader)
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read ({error.strerror}), expected a yaml file; {_REMEDY}.") from None
-    except (yaml.YAMLError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        reason = " ".join(str(error).split())
-        raise RecordingError(f"{path}: expected yaml, found something else ({reason}); {_REMEDY}.") from None
-    if not isinstance(content, Mapping):
-        raise RecordingError(f"{path}: expected a yaml mapping, found {type(content).__name__}; {_REMEDY}.")
-    return content
-
-
 def read_protocol(folder: Path) -> DataProtocol:
     """Return the scenario's protocol, with its defaults where the folder has none or it is silent."""
-    path = folder / "data_protocol.yaml"
+    path = folder / PROTOCOL
     if not path.is_file():
         return DataProtocol()
     content = load_yaml(path)
@@ -113,11 +92,11 @@ def read_protocol(folder: Path) -> DataProtocol:
 
 def read_record(path: Path, cache: ArrayCache | None = None) -> AgentRecord:
     """Return one agent's yaml, from the cache where it has been read before: parsing takes tens of milliseconds."""
-    kept = cache.load(path, "opv2v1") if cache is not None and path.is_file() else None
+    kept = cache.load(path, _CACHE_KIND) if cache is not None and path.is_file() else None
     if kept is None or kept.ndim != 2 or kept.shape[1] != _COLUMNS:
         kept = _parse(path)
         if cache is not None:
-            cache.store(path, "opv2v1", kept)
+            cache.store(path, _CACHE_KIND, kept)
     agent, vehicles = kept[0], kept[1:]
     return AgentRecord(
         lidar_pose=tuple(agent[:6].tolist()),
@@ -131,6 +110,10 @@ def read_record(path: Path, cache: ArrayCache | None = None) -> AgentRecord:
         extent=vehicles[:, 8:11],
         angle=vehicles[:, 11:14],
         speed=vehicles[:, 14],
+        link=vehicles[:, 15].astype(np.int64),
+        has_matrix=bool(agent[14]),
+        has_links=bool(int(agent[15]) & 1),
+        has_named_types=bool(int(agent[15]) & 2),
     )
 
 
@@ -143,10 +126,11 @@ def _parse(path: Path) -> np.ndarray:
     if not isinstance(vehicles, Mapping | None):
         raise RecordingError(f"{path}: expected a mapping at 'vehicles', found {shorten(vehicles)}; {_REMEDY}.")
     rows = np.zeros((1 + len(vehicles or ()), _COLUMNS))
-    rows[0, :6] = _numbers(path, content, "lidar_pose", 6)
-    rows[0, 6:12] = _numbers(path, content, "true_ego_pos", 6) if content.get("true_ego_pos") is not None else np.nan
+    rows[0, :6], rows[0, 14] = _pose(path, content, "lidar_pose")
+    rows[0, 6:12] = _pose(path, content, "true_ego_pos")[0] if content.get("true_ego_pos") is not None else np.nan
     rows[0, 12] = _numbers(path, content, "ego_speed", 1)[0] if content.get("ego_speed") is not None else 0.0
     rows[0, 13] = bool(content.get("RSU", _below_zero(path.parent.name)))
+    has_links = has_named_types = False
     for row, (key, vehicle) in zip(rows[1:], (vehicles or {}).items()):
         yaml_path = f"vehicles.{key}"
         if not isinstance(vehicle, Mapping):
@@ -163,7 +147,50 @@ def _parse(path: Path) -> np.ndarray:
             row[start : start + 3] = _numbers(path, vehicle, name, 3, yaml_path)
         row[14] = _numbers(path, vehicle, "speed", 1, yaml_path)[0] if vehicle.get("speed") is not None else 0.0
         row[1] = _label(vehicle, 2 * row[8:11])
+        row[15] = _link(path, vehicle, yaml_path)
+        has_links |= vehicle.get("ass_id") is not None
+        has_named_types |= str(vehicle.get("obj_type", ""))[:1].isupper()
+    rows[0, 15] = has_links + 2 * has_named_types
     return rows
+
+
+def _link(path: Path, vehicle: Mapping[Any, Any], yaml_path: str) -> int:
+    found = vehicle.get("ass_id")
+    if found is None:
+        return -1
+    if isinstance(found, bool) or not isinstance(found, int) or not -1 <= found <= _MAX_ID:
+        raise RecordingError(
+            f"{path}: expected a whole number from -1 at '{yaml_path}.ass_id', found {shorten(found)}; {_REMEDY}."
+        )
+    return found
+
+
+def _pose(path: Path, content: Mapping[Any, Any], key: str) -> tuple[Sequence[float], bool]:
+    """Return [x, y, z, roll, yaw, pitch], and whether it stood as a 4x4 matrix."""
+    found = content.get(key)
+    if not (isinstance(found, list) and found and isinstance(found[0], list)):
+        return _numbers(path, content, key, 6), False
+    values = (
+        [v for row in found for v in row] if [len(row) for row in found[:5] if isinstance(row, list)] == [4] * 4 else []
+    )
+    try:
+        matrix = np.array([float(v) for v in values if not isinstance(v, (list, Mapping))])
+    except (TypeError, ValueError, OverflowError):
+        matrix = np.zeros(0)
+    if len(found) != 4 or matrix.size != 16 or not np.isfinite(matrix).all():
+        raise RecordingError(
+            f"{path}: expected 6 numbers or a 4x4 matrix of finite numbers at '{key}', found {shorten(found)}; {_REMEDY}."
+        )
+    matrix = matrix.reshape(4, 4)
+    left, scale, right = np.linalg.svd(matrix[:3, :3])
+    is_motion = np.abs(scale - 1).max() <= _NOT_A_ROTATION and np.linalg.det(matrix[:3, :3]) > 0
+    if not is_motion or np.abs(matrix[3] - (0, 0, 0, 1)).max() > _NOT_A_ROTATION:
+        raise RecordingError(
+            f"{path}: the matrix at '{key}' is no rigid motion (singular values {np.round(scale, 3).tolist()}, last row "
+            f"{shorten(matrix[3].tolist())}); write world_from_lidar with an orthonormal, right-handed rotation."
+        )
+    matrix[:3, :3] = left @ right
+    return pose_of_matrix(matrix), True
 
 
 def _below_zero(agent: str) -> bool:
@@ -186,15 +213,17 @@ def _numbers(path: Path, content: Mapping[Any, Any], key: str, count: int, yaml_
 
 
 def _label(vehicle: Mapping[Any, Any], size: np.ndarray) -> int:
-    """Return index into LABELS: by name where the file has one, else by size.
+    """Return index into LABELS: by name where the file has one, else by size; -1 of a type that is none of them.
 
-    OPV2V names no class. Our writer adds ``obj_type``; some releases have CARLA's blueprint as ``bp_id``. The sizes
+    OPV2V names no class. Our writer and real recordings have ``obj_type``; some releases have CARLA's blueprint as ``bp_id``.
+    The sizes
     part CARLA's own vehicles: buses from 9 m, trucks from 6.5 m or as wide and high as its 5.2 m delivery truck, vans
     from 2 m height. A high pick-up counts as a van.
     """
     stated = str(vehicle.get("obj_type", "")).lower()
-    if stated in LABELS:
-        return LABELS.index(stated)
+    if stated:
+        label = find_label(stated)
+        return -1 if label is None else label
     blueprint = str(vehicle.get("bp_id", "")).lower()
     for label, words in (("bus", _BUSES), ("truck", _TRUCKS), ("van", _VANS)):
         if any(word in blueprint for word in words):

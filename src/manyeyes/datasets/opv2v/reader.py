@@ -1,17 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OPV2V and V2XSet, read: ``<split>/<scenario>/<agent>/<stem>.{pcd,yaml}``, and ``<stem>_camera0.png`` ….
+"""OPV2V's layout, read: ``<split>/<scenario>/<agent>/<stem>.{pcd,yaml}``, and ``<stem>_camera0.png`` ….
 
-On disk everything is left-handed, in degrees and km/h, and points lie in the LiDAR's frame. What comes out is
-right-handed, in radians and m/s, and points lie in the agent's frame, whose z = 0 is the road. The format has neither
-the time of a point, nor an agent's estimate of its own error (both read as zero), nor vehicles that no agent lists.
+OPV2V and V2XSet are left-handed; V2V4Real and V2X-Real, which have the layout but not the axes, are in ``dialect``. On disk
+everything is in degrees and km/h, and points lie in the LiDAR's frame. What comes out is right-handed, in radians and m/s, and
+points lie in the agent's frame, whose z = 0 is the road. The format has neither the time of a point, nor an agent's estimate of
+its own error (both read as zero), nor vehicles that no agent lists.
 """
 
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -22,14 +21,25 @@ from manyeyes.datasets.base import RecordingReader, require_index
 from manyeyes.datasets.deferred import DeferredCloud
 from manyeyes.datasets.formats.cache import ArrayCache, default_cache_folder
 from manyeyes.datasets.formats.pcd import PcdCloud, read_pcd
+from manyeyes.datasets.formats.point_file import read_bin
 from manyeyes.datasets.ground_height import PLAUSIBLE_HEIGHT_M, estimate_sensor_height
 from manyeyes.datasets.manifest import SCENARIO, Digests, list_scenario_files
 from manyeyes.datasets.mismatch import find_mismatched_files
 from manyeyes.datasets.missing import FileProblem
 from manyeyes.datasets.opv2v.camera import read_images
 from manyeyes.datasets.opv2v.carla import mirror_points, transform_from_carla
-from manyeyes.datasets.opv2v.metadata import KMH_PER_MPS, AgentRecord, DataProtocol, read_protocol, read_record
+from manyeyes.datasets.opv2v.dialect import OPV2V, Dialect, choose_dialect, name_dialect
+from manyeyes.datasets.opv2v.metadata import (
+    KMH_PER_MPS,
+    PROTOCOL,
+    AgentRecord,
+    DataProtocol,
+    read_protocol,
+    read_record,
+)
+from manyeyes.datasets.opv2v.object_lists import MergedList, merge_lists
 from manyeyes.datasets.opv2v.scan import (
+    BINARY,
     AgentFiles,
     ScenarioFiles,
     compare_with_manifest,
@@ -39,23 +49,26 @@ from manyeyes.datasets.opv2v.scan import (
     scan_scenario,
 )
 from manyeyes.datasets.registry import register_dataset
-from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, RecordingError, Snapshot, Transform
+from manyeyes.datatypes import AgentFrame, GroundTruth, PointCloud, RecordingError, Snapshot, Transform
 
 _MAX_CACHED_RECORDS = 20_000
+# How many first frames are searched for one that lists objects, and so tells the data set.
+_MAX_TOLD_STEMS = 20
 
 
 @register_dataset(
     "opv2v",
     matches=contains_scenarios,
-    layout="folders <scenario>/<agent>/<stem>.pcd and .yaml, agents named by numbers",
+    layout="folders <scenario>/<agent>/<stem>.pcd or .bin, and .yaml, agents named by numbers",
 )
 class Opv2vRecording(RecordingReader):
-    """Scenarios of OPV2V's layout under a root: a dataset (name the split), a folder of scenarios, or one scenario.
+    """Scenarios in OPV2V's layout under a root: a dataset (name the split), a folder of scenarios, or one scenario.
 
     The ego is the first agent by string order, infrastructure comes last, and the ego's frames are the snapshots; an
     agent that lacks a frame is left out of that snapshot. What is missing stands in ``missing_summary``, one line each; with
     strict it is an error instead. Clouds are read when a snapshot is asked for; pictures too, with images=True.
     cache_folder: where parsed yaml and ascii clouds are kept (default: the user's cache folder); None with ``use_cache=False``.
+    dialect: the data set whose axes and types the files have; None: by names of folders, and by the first metadata.
 
     All agents of a scenario have the same stems in OPV2V and V2XSet: their public reader finds every agent by the ego's
     stems. A stem that any agent has is hence expected of all, the ego included; ``verify`` names each file that is absent,
@@ -74,6 +87,7 @@ class Opv2vRecording(RecordingReader):
         use_cache: bool = True,
         cache_folder: Path | None = None,
         images: bool = False,
+        dialect: Dialect | None = None,
     ) -> None:
         self.root = Path(root)
         self.split = split
@@ -94,9 +108,10 @@ class Opv2vRecording(RecordingReader):
             more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
             first = f"{problems[0]}{more}" if problems else "it is empty"
             raise RecordingError(f"{self.root}: expected whole scenarios; {first}. Download what is missing.")
+        self._dialect, self._dialects = dialect, dict[str, Dialect]()
         self._records: dict[Path, AgentRecord] = {}
         self._poses: dict[tuple[Path, str], tuple[np.ndarray, np.ndarray, float]] = {}
-        self._lists: dict[tuple[str, int], _ListedVehicles] = {}
+        self._lists: dict[tuple[str, int], MergedList] = {}
         self._protocols: dict[str, DataProtocol] = {}
         self._heights: dict[Path, float] = {}
 
@@ -134,8 +149,33 @@ class Opv2vRecording(RecordingReader):
             records = [self._record(agent.folder / f"{stem}.yaml") for agent in present]
             if len(self._lists) >= _MAX_CACHED_RECORDS:
                 self._lists.clear()
-            self._lists[scenario, index] = _merge_lists(records, [agent.id for agent in present])
-        return _truth(self._lists[scenario, index], frames)
+            self._lists[scenario, index] = merge_lists(records, [agent.id for agent in present], self.dialect(scenario))
+        return GroundTruth(*self._lists[scenario, index].copy(), Transform.stack([f.world_from_agent for f in frames]))
+
+    def dialect(self, scenario: str) -> Dialect:
+        """Return the data set whose axes and types the files of a scenario have."""
+        if scenario not in self._dialects:
+            self._dialects[scenario] = self._dialect or self._find_dialect(self._scenario(scenario))
+        return self._dialects[scenario]
+
+    def _find_dialect(self, scenario: ScenarioFiles) -> Dialect:
+        """Find the dialect by names, and where they do not tell, by the first frames' metadata."""
+        agents = [agent.folder.name for agent in scenario.agents]
+        named = name_dialect(scenario.folder.name, any(agent.binary for agent in scenario.agents))
+        if named is not None:
+            return named
+        for stem in scenario.stems[:_MAX_TOLD_STEMS]:
+            records = [r for agent in scenario.agents if stem in agent.stems if (r := self._try_record(agent, stem))]
+            if any(len(record.id) or record.has_matrix for record in records):
+                return choose_dialect(agents, records)
+        return OPV2V
+
+    def _try_record(self, agent: AgentFiles, stem: str) -> AgentRecord | None:
+        """Return a frame's metadata; None where they are damaged, which is an error of that frame alone."""
+        try:
+            return self._record(agent.folder / f"{stem}.yaml")
+        except RecordingError:
+            return None
 
     def present_agents(self, scenario: str, index: int) -> tuple[int, ...]:
         """Return the ids of the agents that have this frame, in the order of the snapshot's frames."""
@@ -180,7 +220,7 @@ class Opv2vRecording(RecordingReader):
         """Return the paths of the clouds of each snapshot, by agent."""
         scenario = self._scenarios[name]
         return [
-            {agent.id: agent.folder / f"{stem}.pcd" for agent in scenario.agents if stem in agent.stems}
+            {agent.id: agent.cloud_path(stem) for agent in scenario.agents if stem in agent.stems}
             for stem in scenario.stems
         ]
 
@@ -200,6 +240,11 @@ class Opv2vRecording(RecordingReader):
             self._protocols[scenario] = read_protocol(self._scenario(scenario).folder)
         return self._protocols[scenario]
 
+    def _delta_s(self, scenario: str) -> float:
+        """Return the seconds between two stems: of data_protocol.yaml, else those of the data set."""
+        has_protocol = (self._scenario(scenario).folder / PROTOCOL).is_file()
+        return self._protocol(scenario).fixed_delta_s if has_protocol else self.dialect(scenario).delta_s
+
     def _record(self, path: Path) -> AgentRecord:
         if path not in self._records:
             if len(self._records) >= _MAX_CACHED_RECORDS:
@@ -208,12 +253,13 @@ class Opv2vRecording(RecordingReader):
         return self._records[path]
 
     def _cloud(self, agent: AgentFiles, stem: str) -> PcdCloud:
-        return read_pcd(agent.folder / f"{stem}.pcd", self._drop_nan, self._cache)
+        path = agent.cloud_path(stem)
+        return read_bin(path, self._drop_nan) if path.suffix == BINARY else read_pcd(path, self._drop_nan, self._cache)
 
-    def _points(self, agent: AgentFiles, stem: str, height: float) -> PointCloud:
+    def _points(self, agent: AgentFiles, stem: str, height: float, is_right_handed: bool) -> PointCloud:
         """Read the cloud of an agent in its frame."""
         cloud = self._cloud(agent, stem)
-        xyz = mirror_points(cloud.xyz)
+        xyz = np.array(cloud.xyz, np.float32) if is_right_handed else mirror_points(cloud.xyz)
         xyz[:, 2] += np.float32(height)
         return PointCloud.of(torch.from_numpy(xyz), torch.from_numpy(cloud.intensity))
 
@@ -222,11 +268,12 @@ class Opv2vRecording(RecordingReader):
     ) -> AgentFrame:
         yaml = agent.folder / f"{stem}.yaml"
         record = self._record(yaml)
-        world_from_agent, height = self._pose(agent, stem)
-        read = partial(self._points, agent, stem, height)
+        dialect = self.dialect(scenario)
+        world_from_agent, height = self._pose(agent, stem, dialect)
+        read = partial(self._points, agent, stem, height, dialect.is_right_handed)
         return AgentFrame(
             agent_id=agent.id,
-            timestamp_ns=round(int(stem) * self._protocol(scenario).fixed_delta_s * 1e9),
+            timestamp_ns=round(int(stem) * self._delta_s(scenario) * 1e9),
             points=DeferredCloud(read) if is_deferred else read(),
             world_from_agent=world_from_agent,
             pose_covariance=torch.zeros(3, 3, dtype=torch.float64),
@@ -236,12 +283,12 @@ class Opv2vRecording(RecordingReader):
             images=read_images(yaml, world_from_agent, self._cache) if images else (),
         )
 
-    def _pose(self, agent: AgentFiles, stem: str) -> tuple[Transform, float]:
+    def _pose(self, agent: AgentFiles, stem: str, dialect: Dialect) -> tuple[Transform, float]:
         """Return the pose of an agent's frame, and the height of its LiDAR above the road."""
         if (agent.folder, stem) not in self._poses:
             record = self._record(agent.folder / f"{stem}.yaml")
-            world_from_lidar = transform_from_carla(record.lidar_pose)
-            height = self._sensor_height(agent, record, world_from_lidar)
+            world_from_lidar = dialect.world_from_lidar(record.lidar_pose)
+            height = self._sensor_height(agent, record, world_from_lidar, dialect)
             pose = world_from_lidar @ Transform.from_xyz_yaw(0, 0, -height)
             if len(self._poses) >= _MAX_CACHED_RECORDS:
                 self._poses.clear()
@@ -249,13 +296,15 @@ class Opv2vRecording(RecordingReader):
         rotation, translation, height = self._poses[agent.folder, stem]
         return Transform(torch.from_numpy(rotation.copy()), torch.from_numpy(translation.copy())), height
 
-    def _sensor_height(self, agent: AgentFiles, record: AgentRecord, world_from_lidar: Transform) -> float:
+    def _sensor_height(
+        self, agent: AgentFiles, record: AgentRecord, world_from_lidar: Transform, dialect: Dialect
+    ) -> float:
         """Return the metres from the road up to the LiDAR along the LiDAR's z axis.
 
         By the two poses where they say something plausible. Where a pole's place is its sensor's own, the ground is
         searched in the agent's first cloud, once, so that the height is the same in every frame.
         """
-        stated = _stated_height(record, world_from_lidar)
+        stated = None if dialect.is_right_handed else _stated_height(record, world_from_lidar)
         if stated is not None:
             return stated
         if agent.folder not in self._heights:
@@ -271,48 +320,6 @@ def _stated_height(record: AgentRecord, world_from_lidar: Transform) -> float | 
     height = float(offset @ world_from_lidar.rotation[:, 2])
     low, high = PLAUSIBLE_HEIGHT_M
     return height if low <= height <= high and float(offset.norm()) <= high else None
-
-
-@dataclass(frozen=True)
-class _ListedVehicles:
-    """The union of all agents' lists by id, first agent's copy, in the order of ids, as arrays of V vehicles.
-
-    seen: (agents, V). center: (V, 3), size: (V, 3), yaw, label, id: (V,), velocity: (V, 2), as in Boxes.
-    """
-
-    seen: np.ndarray
-    center: np.ndarray
-    size: np.ndarray
-    yaw: np.ndarray
-    label: np.ndarray
-    id: np.ndarray
-    velocity: np.ndarray
-
-
-def _merge_lists(records: list[AgentRecord], agent_ids: Sequence[int]) -> _ListedVehicles:
-    listed = [np.where(r.id != agent_id)[0] for agent_id, r in zip(agent_ids, records)]
-    id = np.concatenate([r.id[rows] for r, rows in zip(records, listed)])
-    _, first = np.unique(id, return_index=True)
-    seen = np.stack([np.isin(id[first], r.id[rows]) for r, rows in zip(records, listed)])
-
-    def column(name: str) -> np.ndarray:
-        return np.concatenate([getattr(r, name)[rows] for r, rows in zip(records, listed)])[first]
-
-    center = column("location") + column("center")
-    center[:, 1] *= -1
-    yaw = torch.from_numpy(-column("angle")[:, 1] * (math.pi / 180))
-    velocity = torch.stack((yaw.cos(), yaw.sin()), 1) * (torch.from_numpy(column("speed")) / KMH_PER_MPS)[:, None]
-    return _ListedVehicles(
-        seen, center, 2 * column("extent"), yaw.numpy(), column("label"), id[first], velocity.numpy()
-    )
-
-
-def _truth(listed: _ListedVehicles, frames: tuple[AgentFrame, ...]) -> GroundTruth:
-    """Return the truth with the poses of frames; every tensor is a copy."""
-    names = ("center", "size", "yaw", "label", "id", "velocity")
-    boxes = Boxes.of(**{name: torch.from_numpy(getattr(listed, name).copy()) for name in names})
-    seen = torch.from_numpy(listed.seen.copy())
-    return GroundTruth(boxes, seen, Transform.stack([f.world_from_agent for f in frames]))
 
 
 def _state(files: Sequence[Path], folder: Path) -> np.ndarray:

@@ -16,19 +16,30 @@ from manyeyes.datasets.opv2v.camera import describe_missing_images, find_missing
 from manyeyes.datatypes import RecordingError
 
 _AGENT = re.compile(r"-?\d+")
+PCD, BINARY = ".pcd", ".bin"
+# What lies in folders of other layouts whose names are numbers, too.
+_FOREIGN = ("velodyne", "poses.csv")
 SPLIT_FOLDERS = {"val": "validate"}
 """Folders of splits whose name is another one."""
 
 
 @dataclass(frozen=True)
 class AgentFiles:
-    """One agent's files. stems: of frames with a cloud and metadata; pictures: stems that a camera lacks, by its number."""
+    """One agent's files. stems: of frames with a cloud and metadata; pictures: stems that a camera lacks, by its number.
+
+    binary: those of clouds that are ``.bin`` files, not ``.pcd``.
+    """
 
     id: int
     folder: Path
     clouds: frozenset[str]
     records: frozenset[str]
     pictures: Mapping[int, Sequence[str]]
+    binary: frozenset[str] = frozenset()
+
+    def cloud_path(self, stem: str) -> Path:
+        """Return the path of a frame's cloud."""
+        return self.folder / f"{stem}{BINARY if stem in self.binary else PCD}"
 
     @cached_property
     def stems(self) -> frozenset[str]:
@@ -51,7 +62,12 @@ def _subfolders(folder: Path) -> list[Path]:
 
 
 def _is_scenario(folder: Path) -> bool:
-    return any(_AGENT.fullmatch(p.name) and not _is_scenario(p) for p in _subfolders(folder))
+    return any(_is_agent(p) for p in _subfolders(folder))
+
+
+def _is_agent(folder: Path) -> bool:
+    is_foreign = any((folder / name).exists() for name in _FOREIGN)
+    return _AGENT.fullmatch(folder.name) is not None and not is_foreign and not _is_scenario(folder)
 
 
 def contains_scenarios(path: Path) -> bool:
@@ -69,7 +85,7 @@ def contains_scenarios(path: Path) -> bool:
 def has_frames(folder: Path) -> bool:
     """Return whether a folder has agents with clouds or metadata, that is, whether it is a scenario with anything in it."""
     agents = [p for p in _subfolders(folder) if _AGENT.fullmatch(p.name)]
-    return any(p.suffix in (".pcd", ".yaml") and p.stem.isdecimal() for agent in agents for p in agent.iterdir())
+    return any(p.suffix in (PCD, BINARY, ".yaml") and p.stem.isdecimal() for agent in agents for p in agent.iterdir())
 
 
 def get_split_folder(root: Path, split: str | None) -> Path:
@@ -142,11 +158,13 @@ def scan_scenario(folder: Path, problems: list[str], missing: list[FileProblem],
 def _scan_agent(folder: Path, problems: list[str], images: bool) -> AgentFiles:
     everything = list(folder.iterdir())
     files = [p for p in everything if p.stem.isdecimal()]
-    clouds = frozenset(p.stem for p in files if p.suffix == ".pcd")
+    with_header = frozenset(p.stem for p in files if p.suffix == PCD)
+    binary = frozenset(p.stem for p in files if p.suffix == BINARY) - with_header
+    clouds, cloud_suffix = with_header | binary, "bin" if len(binary) > len(with_header) else "pcd"
     records = frozenset(p.stem for p in files if p.suffix == ".yaml")
     if not clouds and not records:
         problems.append(f"{folder}: holds neither pcd nor yaml, the agent is left out")
-    for there, suffix in ((clouds - records, "yaml"), (records - clouds, "pcd")):
+    for there, suffix in ((clouds - records, "yaml"), (records - clouds, cloud_suffix)):
         if there:
             count = f"{len(there)} of {len(clouds | records)} frames"
             problems.append(f"{folder}: {count} lack their {suffix}, the first is {min(there, key=int)}; left out")
@@ -154,7 +172,7 @@ def _scan_agent(folder: Path, problems: list[str], images: bool) -> AgentFiles:
     if images:
         problems += [f"{folder}: {line}" for line in describe_missing_images(everything, stems)]
     return AgentFiles(
-        int(folder.name), folder, clouds, records, find_missing_images(everything, stems) if images else {}
+        int(folder.name), folder, clouds, records, find_missing_images(everything, stems) if images else {}, binary
     )
 
 
@@ -166,7 +184,11 @@ def _absent_files(folder: Path, agents: Sequence[AgentFiles]) -> Iterator[FilePr
         yield FileProblem(folder, "missing", folder.name, "no agent of the scenario has a frame")
     for agent in agents:
         for stem in sorted(stems, key=int):
-            for there, beside, suffix in ((agent.clouds, agent.records, "pcd"), (agent.records, agent.clouds, "yaml")):
+            cloud_suffix = "bin" if agent.binary else "pcd"
+            for there, beside, suffix in (
+                (agent.clouds, agent.records, cloud_suffix),
+                (agent.records, agent.clouds, "yaml"),
+            ):
                 if stem not in there:
                     reason = "the other file of its frame is there" if stem in beside else "other agents have the frame"
                     yield FileProblem(agent.folder / f"{stem}.{suffix}", "missing", folder.name, reason)

@@ -104,4 +104,8 @@ def _record_of(snapshot: Snapshot, row: int, box_speed_mps: torch.Tensor | None)
         extent=size / 2,
         angle=angle,
         speed=speed.double().numpy() * KMH_PER_MPS,
+        link=np.full(len(boxes), -1),
+        has_matrix=False,
+        has_links=False,
+        has_named_types=False,
     )

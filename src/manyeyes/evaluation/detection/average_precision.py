@@ -6,7 +6,7 @@ prior poses displace the content of collaborators' messages; they never move the
 
 **Truth of an ego** (:func:`select_ego_truth`): the union of the boxes listed by every agent whose *true* position lies within
 ``com_range_m`` of the ego's (in the plane, the ego included), one box per id, without the ego's own body, moved into the
-ego's frame by its *true* pose, within the range.
+ego's frame by its *true* pose, within the range. Boxes of other classes than the protocol's (vehicles) do not count, on both sides.
 
 **Detections that count** (:func:`filter_detections`), in this order: score > ``score_threshold``; optionally dropped when
 their axis-aligned extent exceeds ``drop_large_axis_aligned_m``; optionally all corners within ``z_filter``; greedy
@@ -46,7 +46,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from manyeyes.datatypes import Boxes, ConfigError, RecordingError, Snapshot
+from manyeyes.datatypes import VEHICLES, AgentFrame, Boxes, ConfigError, GroundTruth, RecordingError, Snapshot
 from manyeyes.ops.box_iou import pairwise_iou
 from manyeyes.ops.nms import rotated_nms
 
@@ -61,7 +61,8 @@ class DetectionProtocol:
     ap_order: which of the two APs is this protocol's own. z_origin_m: height above the road of the origin that the z values
     of gt_range and z_filter are relative to. min_points_in_gt: LiDAR returns of all agents in range that a truth box
     needs. count_frames_without_det: false leaves out the truth of frames without a detection (a known defect).
-    drop_first_segment: the sum for AP starts at the first detection's recall (DAIR-V2X).
+    drop_first_segment: the sum for AP starts at the first detection's recall (DAIR-V2X). classes: of ``datatypes.CLASSES``; boxes
+    of others are neither truth nor detections.
     """
 
     name: str
@@ -80,6 +81,7 @@ class DetectionProtocol:
     count_frames_without_det: bool = True
     matching: Literal["remaining", "best", "truth_first"] = "remaining"
     drop_first_segment: bool = False
+    classes: tuple[str, ...] = VEHICLES
 
     def with_range(self, gt_range: tuple[float, float, float, float, float, float]) -> DetectionProtocol:
         """Return the same rules over another range."""
@@ -212,23 +214,23 @@ def select_ego_truth(snapshot: Snapshot, ego: int, protocol: DetectionProtocol) 
         raise RecordingError(
             f"{snapshot.scenario} #{snapshot.index} has no truth; only recordings with labels are evaluated."
         )
+    truth = truth.of_classes(protocol.classes)
     position = truth.world_from_agent.translation[:, :2]
     near = (position - position[ego]).norm(dim=-1) <= protocol.com_range_m
     listed = truth.seen[near].any(0) & (truth.boxes.id != snapshot.frames[ego].agent_id)
     if protocol.min_points_in_gt > 0:
-        listed &= _count_points(snapshot, near) >= protocol.min_points_in_gt
+        listed &= _count_points(snapshot.frames, truth, near) >= protocol.min_points_in_gt
     boxes = truth.boxes[_select_unique_ids(truth.boxes.id, listed)]
     boxes = boxes.to(torch.float64).transform(truth.world_from_agent[ego].inverse())
     return boxes[is_in_range(boxes, protocol, protocol.gt_range_mode)]
 
 
-def _count_points(snapshot: Snapshot, near: Tensor) -> Tensor:
+def _count_points(frames: Sequence[AgentFrame], truth: GroundTruth, near: Tensor) -> Tensor:
     """Return (N,) int64: the returns of the agents that are near (agents,) in each truth box."""
-    assert snapshot.truth is not None
-    count = torch.zeros(len(snapshot.truth.boxes), dtype=torch.int64)
+    count = torch.zeros(len(truth.boxes), dtype=torch.int64)
     for row in near.nonzero()[:, 0].tolist():
-        boxes = snapshot.truth.boxes.transform(snapshot.truth.world_from_agent[row].inverse())
-        count += boxes.contains(snapshot.frames[row].points.xyz.to(boxes.center.dtype)).sum(1)
+        boxes = truth.boxes.transform(truth.world_from_agent[row].inverse())
+        count += boxes.contains(frames[row].points.xyz.to(boxes.center.dtype)).sum(1)
     return count
 
 
@@ -256,7 +258,7 @@ def is_in_range(boxes: Boxes, protocol: DetectionProtocol, mode: RangeMode) -> T
 
 def filter_detections(boxes: Boxes, protocol: DetectionProtocol) -> Boxes:
     """Return the detections that count, in descending score (ties in the order given), float64."""
-    boxes = boxes.to(torch.float64)
+    boxes = boxes.of_classes(protocol.classes).to(torch.float64)
     boxes = boxes[boxes.score > protocol.score_threshold]
     corners = boxes.corners()
     keep = torch.ones(len(boxes), dtype=torch.bool)
@@ -274,7 +276,7 @@ def filter_detections(boxes: Boxes, protocol: DetectionProtocol) -> Boxes:
 def compute_frame_iou(result: FrameResult, protocol: DetectionProtocol) -> FrameIou:
     """Filters both sides by the protocol (truth by range) and computes their IoU once, for every threshold."""
     found = filter_detections(result.detections, protocol)
-    truth = result.truth.to(torch.float64)
+    truth = result.truth.of_classes(protocol.classes).to(torch.float64)
     truth = truth[is_in_range(truth, protocol, protocol.gt_range_mode)]
     return FrameIou(result.scenario, result.index, found.score, pairwise_iou(found.bev(), truth.bev()))
 

@@ -147,6 +147,7 @@ def _make_landmark_pairs(
         Landmarks.of_keypoints(points) if has_descriptors else _make_landmarks(frame, points.boxes)
         for frame, points in zip(snapshot.frames, keypoints)
     ]
+    truth = truth.of_classes()
     ego_from_world = truth.world_from_agent[0].inverse()
     for row in range(1, len(snapshot.frames)):
         both = truth.boxes.center[truth.seen[0] & truth.seen[row]].double()
@@ -173,6 +174,7 @@ def count_common_objects(snapshot: Snapshot, max_range_m: float) -> int:
     truth = snapshot.truth
     if truth is None:
         return 0
+    truth = truth.of_classes()
     positions = truth.world_from_agent.translation
     in_range = [
         n for n in range(1, len(snapshot.frames)) if float((positions[n] - positions[0])[:2].norm()) <= max_range_m

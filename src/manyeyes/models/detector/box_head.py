@@ -10,7 +10,7 @@ from itertools import accumulate, pairwise
 import torch
 from torch import Tensor, nn
 
-from manyeyes.datatypes import LABELS, Boxes, Sites, SparseBev
+from manyeyes.datatypes import VEHICLE_LABELS, Boxes, Sites, SparseBev
 from manyeyes.models.detector.layers import SubmanifoldLayer
 from manyeyes.ops.nms import rotated_nms
 
@@ -30,7 +30,7 @@ class RawBoxLayout:
         self.total = ends[-1]
 
 
-WIDTHS = (1, 2, 1, 3, 2, 2, len(LABELS), 1, 1, 1, 2)
+WIDTHS = (1, 2, 1, 3, 2, 2, len(VEHICLE_LABELS), 1, 1, 1, 2)
 BOX_LAYOUT = RawBoxLayout()
 
 

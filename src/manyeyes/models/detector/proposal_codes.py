@@ -15,7 +15,7 @@ import math
 import torch
 from torch import Tensor
 
-from manyeyes.datatypes import LABELS
+from manyeyes.datatypes import VEHICLE_LABELS
 from manyeyes.models.detector.box_head import BOX_LAYOUT, SPEED_UNIT, axis_yaw
 from manyeyes.models.detector.proposal import PROPOSAL_DIM
 
@@ -29,7 +29,7 @@ _STEPS = (
     (BOX_LAYOUT.velocity, 0.25 / SPEED_UNIT),
 )
 _FACING_STEP = 1 / 8
-_LEADS = 256 // len(LABELS)
+_LEADS = 256 // len(VEHICLE_LABELS)
 _LEAD_STEP = 16 / _LEADS
 _SIGMA_LOW, _SIGMA_STEP = -4.0, 0.4
 
@@ -74,7 +74,7 @@ def proposal_from_codes(codes: Tensor) -> Tensor:
     proposal[:, BOX_LAYOUT.direction] = ((facing - 128) * _FACING_STEP)[:, None] * _along(axis)
     # The middle of its step: never 0, so that the best class stays the best.
     lead = (torch.remainder(kind, _LEADS) + 0.5) * (_LEAD_STEP / 2)
-    named = torch.arange(len(LABELS)) == kind.div(_LEADS, rounding_mode="floor")[:, None]
+    named = torch.arange(len(VEHICLE_LABELS)) == kind.div(_LEADS, rounding_mode="floor")[:, None]
     proposal[:, BOX_LAYOUT.class_logits] = torch.where(named, lead[:, None], -lead[:, None])
     nibbles = torch.stack((sigma.div(16, rounding_mode="floor"), torch.remainder(sigma, 16)), 1)
     proposal[:, [BOX_LAYOUT.log_sigma_xy.start, BOX_LAYOUT.log_sigma_yaw.start]] = _SIGMA_LOW + _SIGMA_STEP * nibbles

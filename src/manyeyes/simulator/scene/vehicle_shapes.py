@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.datatypes import LABELS, ConfigError
+from manyeyes.datatypes import VEHICLE_LABELS, ConfigError
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.raycast import BOX, Primitives
 
@@ -32,9 +32,9 @@ class VehicleShape:
 
 
 def make_vehicle_shape(kind: str, size: tuple[float, float, float], seed: int, id: int) -> VehicleShape:
-    """Return the body of one vehicle of a kind in LABELS and size (l, w, h); proportions and paint vary with (seed, id)."""
-    if kind not in LABELS:
-        raise ConfigError(f"No body for a vehicle of kind '{kind}'; choose one of {', '.join(LABELS)}.")
+    """Return the body of one vehicle of a kind in VEHICLE_LABELS and size (l, w, h); proportions and paint vary with (seed, id)."""
+    if kind not in VEHICLE_LABELS:
+        raise ConfigError(f"No body for a vehicle of kind '{kind}'; choose one of {', '.join(VEHICLE_LABELS)}.")
     random = keyed_generator(seed, "body", id)
     paint = float(random.choice([0.12, 0.3, 0.5, 0.7, 0.85])) * float(random.uniform(0.85, 1.1))
     vary = random.uniform(-1, 1, 6)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.datatypes import LABELS, ShapeError
+from manyeyes.datatypes import VEHICLE_LABELS, ShapeError
 
 Array = NDArray[np.float64]
 
@@ -80,7 +80,7 @@ def draw_vehicles(
     random: np.random.Generator, count: int, kind_fractions: tuple[float, ...] = KIND_FRACTIONS
 ) -> tuple[NDArray[np.int64], Array]:
     """Return kinds (N,) by shares over LABELS, and sizes (N, 3); long cars tend to be wide ones."""
-    kind = random.choice(len(LABELS), count, p=kind_fractions).astype(np.int64)
+    kind = random.choice(len(VEHICLE_LABELS), count, p=kind_fractions).astype(np.int64)
     unit = random.random((count, 3))
     unit[:, 1] = (unit[:, 0] + unit[:, 1]) / 2
     low, high = _SIZE_RANGES[kind, :, 0], _SIZE_RANGES[kind, :, 1]

@@ -327,7 +327,7 @@ def _truth(snapshot: Snapshot) -> GroundTruth:
         raise ConfigError(
             f"Scenario {snapshot.scenario}, frame {snapshot.index} has no truth: it cannot be used for training or evaluation."
         )
-    return snapshot.truth
+    return snapshot.truth.of_classes()
 
 
 def _displaced(pose: Transform, off: np.ndarray | None) -> Transform:
