@@ -22,7 +22,7 @@ import torch
 
 from manyeyes.simulator.scene.scenario import NoSceneError, ScenarioSpec, SimulatedScenario, make_scenario
 from manyeyes.simulator.scene.towns import load_town
-from manyeyes.simulator.sensors.lidar import lidar_spec
+from manyeyes.simulator.sensors.lidars import lidar_spec
 from manyeyes.studies.provenance import write_json
 
 BAR_MS = 80.0

@@ -12,7 +12,8 @@ from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, Snapshot, Transfo
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.raycast import BOX, CYLINDER, ELLIPSOID, HeightField, Primitives
 from manyeyes.simulator.scene.vehicle_shapes import make_vehicle_shape, place_vehicle_shapes, rotation_from_yaw_pitch
-from manyeyes.simulator.sensors.lidar import RaycastScene, lidar_spec, scan
+from manyeyes.simulator.sensors.lidar import RaycastScene, scan
+from manyeyes.simulator.sensors.lidars import lidar_spec
 
 CARS, BUILDINGS, POLES, TREES = 55, 40, 40, 50
 ROAD_HALF_M = 8.0

@@ -20,7 +20,15 @@ from manyeyes.viz.map_figures import MapPanel, save_figure
 map_model = pretrained.load_map_model()
 town = load_town("generated-3")
 spec = ScenarioSpec(
-    "generated-3", seed=3, name="street", vehicles=4, frames=2, history_frames=0, roadside_chance=1.0, density=6.0
+    "generated-3",
+    3,
+    "street",
+    vehicles=4,
+    frames=2,
+    history_frames=0,
+    roadside_chance=1.0,
+    density=6.0,
+    intensity="material",
 )
 scene = make_scenario(spec, town)
 frames = scene.snapshot(0).frames

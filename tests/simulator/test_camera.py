@@ -12,7 +12,8 @@ from manyeyes.simulator.scene.scenario import true_boxes
 from manyeyes.simulator.scene.vehicle_shapes import make_vehicle_shape, place_vehicle_shapes
 from manyeyes.simulator.scene.vehicles import VehicleStates
 from manyeyes.simulator.sensors.camera import CAMERA_RIGS, CameraSpec, LitScene, RenderedImage, camera_rig, render_image
-from manyeyes.simulator.sensors.lidar import ASPHALT, PAINT, LidarSpec, RaycastScene, scan
+from manyeyes.simulator.sensors.lidar import ASPHALT, PAINT, RaycastScene, scan
+from manyeyes.simulator.sensors.lidar_spec import LidarSpec
 from manyeyes.simulator.sensors.lighting import Light
 from manyeyes.simulator.sensors.materials import Materials, make_static_materials, make_vehicle_materials
 

@@ -9,7 +9,9 @@ import torch
 from manyeyes.datatypes import ConfigError, Transform
 from manyeyes.ops.raycast import HeightField, Primitives
 from manyeyes.simulator.scene.vehicle_shapes import make_vehicle_shape, place_vehicle_shapes
-from manyeyes.simulator.sensors.lidar import ASPHALT, LIDAR_PRESETS, PAINT, LidarSpec, RaycastScene, lidar_spec, scan
+from manyeyes.simulator.sensors.lidar import ASPHALT, PAINT, RaycastScene, scan
+from manyeyes.simulator.sensors.lidar_spec import LidarSpec, spread_beams
+from manyeyes.simulator.sensors.lidars import lidar_spec
 
 QUIET = LidarSpec(per_turn=900, drop_general=0, drop_dark=0, drop_grazing=0, range_sigma_m=0)
 HERE = Transform.from_xyz_yaw(0, 0)
@@ -120,11 +122,13 @@ def test_the_presets_match_their_names() -> None:
     forward, instance = scan(scene, HERE, lidar_spec("dair-infrastructure"), (0,))
     assert float(forward.xyz[:, 0].min()) >= 0
     assert set(np.unique(instance)) == {0, 1}
-    assert LIDAR_PRESETS["spinning-64"].elevation.size * LIDAR_PRESETS["spinning-64"].azimuth.size == 115_200
+    assert lidar_spec("spinning-64").num_beams * lidar_spec("spinning-64").azimuth.size == 115_200
 
 
 def test_misuse_is_named() -> None:
     with pytest.raises(ConfigError, match="No LiDAR 'vlp'; choose one of spinning-64, opv2v"):
         lidar_spec("vlp")
-    with pytest.raises(ConfigError, match="beams >= 2"):
-        LidarSpec(beams=1)
+    with pytest.raises(ConfigError, match="at least two beams"):
+        spread_beams(1, -10, 10)
+    with pytest.raises(ConfigError, match=r"LidarSpec without a name: ranges need 0 <= min_range_m < max_range_m; got"):
+        LidarSpec(min_range_m=200.0)

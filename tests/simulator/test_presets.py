@@ -97,3 +97,65 @@ def test_the_demo_runs_without_any_town(tmp_path: Path, monkeypatch: pytest.Monk
 def test_an_unknown_preset_lists_the_known_ones() -> None:
     with pytest.raises(ConfigError, match="No simulation preset 'town'; choose one of carla-towns-small"):
         simulation_preset("town")
+
+
+def test_presets_of_published_tables_store_material_intensity_of_todays_sensors() -> None:
+    names = ("carla-towns-small", "carla-towns-large", "carla-maps", "carla-maps-camera", "demo", "dair-crossing")
+    for name in (*names, "smoke-opv2v", "smoke-dair"):
+        specs = {(job.spec.intensity, job.spec.sensor_mix) for job in make_jobs(simulation_preset(name), 0)}
+        assert specs == {("material", "none")}, name
+
+
+def test_mixed_sensors_train_on_the_towns_and_rates_stated() -> None:
+    jobs = make_jobs(simulation_preset("carla-sensors-small"), 0)
+    train = [job for job in jobs if job.split == "train"]
+    assert 120 <= len(train) <= 150
+    assert {job.spec.town for job in train} == {"Town01", "Town02", "Town03", "Town04", "Town06"}
+    assert {job.spec.town for job in jobs if job.split == "validate"} == {"Town07"}
+    assert {job.spec.town for job in jobs if job.split == "test"} == {"Town05", "Town10HD"}
+    assert {(job.spec.sensor_mix, job.spec.intensity) for job in jobs} == {("all", "material")}
+    assert {job.spec.rate_hz for job in train} == {10.0, 20.0}
+    seeds = {job.spec.seed for job in make_jobs(simulation_preset("carla-towns-small"), 0)}
+    assert not seeds & {job.spec.seed for job in jobs}
+
+
+def test_the_sensor_matrix_has_the_same_scenes_with_other_beams() -> None:
+    def scenes(name: str) -> list[tuple[str, str, int, float]]:
+        jobs = [job for job in make_jobs(simulation_preset(name), 0) if job.split != "train"]
+        return [(job.split, job.spec.name, job.spec.seed, job.spec.density) for job in jobs]
+
+    first = scenes("carla-beams-16")
+    assert {split for split, *_ in first} == {"validate", "test"}
+    for name in ("carla-beams-32", "carla-beams-64", "carla-beams-128", "carla-unseen-sensor"):
+        assert scenes(name) == first
+    unseen = make_jobs(simulation_preset("carla-unseen-sensor"), 0)
+    assert {job.spec.agent_lidar(agent).name for job in unseen for agent in (1, -1)} == {"unseen-sensor"}
+    assert {job.spec.intensity for job in unseen} == {None}
+
+
+# make_scenario tries this number of seeds from that of a specification.
+ATTEMPTS = 40
+
+
+def test_sealed_scenes_have_seeds_and_generated_towns_of_no_other_preset() -> None:
+    """Only specifications are made here: no scene of the sealed split may be simulated before the final tables."""
+    sealed = make_jobs(simulation_preset("sealed-2026b"), 0)
+    assert {job.split for job in sealed} == {"town05", "town10hd", "generated", "generated-sensors"}
+    own = {job.spec.seed + i for job in sealed for i in range(ATTEMPTS)}
+    towns = {job.spec.town for job in sealed if job.spec.town.startswith("generated-")}
+    assert min(int(town.removeprefix("generated-")) for town in towns) == 101
+    for name in SIMULATION_PRESETS:
+        if name != "sealed-2026b":
+            others = make_jobs(simulation_preset(name), 0)
+            assert not own & {job.spec.seed + i for job in others for i in range(ATTEMPTS)}, name
+            assert not towns & {job.spec.town for job in others}, name
+    strata = {split: {job.spec.town for job in sealed if job.split == split} for split in {job.split for job in sealed}}
+    assert sum(map(len, strata.values())) == len(set().union(*strata.values()))
+    assert {job.spec.sensor_mix for job in sealed if job.split == "generated-sensors"} == {"all"}
+    assert {job.spec.lidar for job in sealed if job.spec.sensor_mix == "none"} == {"opv2v-16"}
+
+
+def test_mixed_sensors_are_not_written_in_dairs_layout() -> None:
+    preset = simulation_preset("smoke-dair")
+    with pytest.raises(ConfigError, match="Mixed sensors are written in OPV2V's layout only"):
+        replace(preset, splits=(replace(preset.splits[0], sensor_mix="all"),))

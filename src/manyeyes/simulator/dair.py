@@ -36,6 +36,7 @@ from manyeyes.simulator.folder_state import (
     require_sound,
 )
 from manyeyes.simulator.record import (
+    BEFORE_LAWS,
     Job,
     RecordingProgress,
     keep_finished,
@@ -235,7 +236,8 @@ def _content(path: Path) -> dict[str, Any]:
     """Return the content of a drive's file, its specification with the defaults of fields that an older version did not have."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        asked = {**content["asked"], "spec": asdict(ScenarioSpec(**content["asked"]["spec"]))}
+        spec = ScenarioSpec(**{**BEFORE_LAWS, **content["asked"]["spec"]})
+        asked = {**content["asked"], "spec": asdict(spec)}
         parse_entry(content)
         DairRows(**content["rows"])
         return {"asked": json.loads(json.dumps(asked)), "entry": content["entry"], "rows": content["rows"]}

@@ -23,12 +23,14 @@ class SplitPreset:
     """Scenes of one split: count of them, in turn over the towns.
 
     lidar_beams: number of LiDAR beams of all agents of a scene, in turn over the scenes; None for the preset's own sensors.
+    sensor_mix: as in ScenarioSpec; it replaces those sensors.
     """
 
     split: str
     towns: tuple[str, ...]
     count: int
     lidar_beams: tuple[int | None, ...] = (None,)
+    sensor_mix: str = "none"
 
 
 @dataclass(frozen=True)
@@ -40,14 +42,15 @@ class SimulationPreset:
     sender of a message 0.4 s old had half a second of history. density, clutter: of traffic and of roadside objects
     (ScenarioSpec), uniform between these for each scene. fallback_town: generated roads where a town is not found; None makes
     that an error. layout: of the files; dair has one vehicle and the unit, and evaluates every pair. cameras, roadside_cameras:
-    as in ScenarioSpec.
+    as in ScenarioSpec. rates_hz: in turn over the scenes. intensity: a law for all sensors, None for each sensor's own. scene_key:
+    part of the random key of every scene; presets of one key have the same scenes with other sensors.
     """
 
     splits: tuple[SplitPreset, ...]
     frames: int = 16
     history_frames: int = 6
     lead_frames: int = 0
-    rate_hz: float = 10.0
+    rates_hz: tuple[float, ...] = (10.0,)
     vehicles: tuple[int, int] = (1, 4)
     roadside_chance: float = 0.7
     lidar: str = "opv2v"
@@ -59,10 +62,16 @@ class SimulationPreset:
     layout: Literal["opv2v", "dair"] = "opv2v"
     cameras: str = "none"
     roadside_cameras: str = "none"
+    intensity: str | None = None
+    scene_key: str = ""
 
     def __post_init__(self) -> None:
         if self.layout == "dair" and {self.cameras, self.roadside_cameras} != {"none"}:
             raise ConfigError("Pictures are written in OPV2V's layout only; choose a preset of it, or no cameras.")
+        if self.layout == "dair" and any(part.sensor_mix != "none" for part in self.splits):
+            raise ConfigError(
+                "Mixed sensors are written in OPV2V's layout only; choose a preset of it, or no sensor_mix."
+            )
         assert_disjoint_split({part.split: part.towns for part in self.splits})
 
 
@@ -75,10 +84,65 @@ def _towns(train: int, val: int, test: int) -> tuple[SplitPreset, ...]:
 
 
 def _crowded(splits: tuple[SplitPreset, ...]) -> SimulationPreset:
-    """Streets where one agent sees little: much traffic, much that stands in between, and three to five agents mostly."""
+    """Streets where one agent sees little: much traffic, much that stands in between, and three to five agents mostly.
+
+    Intensity is that of the material, which training draws other laws from, and which published tables are measured on.
+    """
     return SimulationPreset(
-        splits, lead_frames=6, vehicles=(2, 4), roadside_chance=0.8, density=(6.0, 10.0), clutter=(1.0, 1.8)
+        splits,
+        lead_frames=6,
+        vehicles=(2, 4),
+        roadside_chance=0.8,
+        density=(6.0, 10.0),
+        clutter=(1.0, 1.8),
+        intensity="material",
     )
+
+
+# For detectors of any sensor: each agent has a sensor, a mounting and a tilt of its own.
+_SENSORS = replace(
+    _crowded(
+        (
+            SplitPreset("train", TOWN_SPLIT["train"], 130, sensor_mix="all"),
+            SplitPreset("val", TOWN_SPLIT["val"], 16, sensor_mix="all"),
+            SplitPreset("test", TOWN_SPLIT["test"], 28, sensor_mix="all"),
+        )
+    ),
+    lead_frames=0,
+    rates_hz=(10.0, 10.0, 20.0),
+    scene_key="sensors",
+)
+
+
+def _one_sensor(mix: str, val: int = 8, test: int = 16) -> SimulationPreset:
+    """Scenes for evaluation, the same in every such preset, with one sensor for all vehicles and one for all poles."""
+    return replace(
+        _crowded(
+            (
+                SplitPreset("val", TOWN_SPLIT["val"], val, sensor_mix=mix),
+                SplitPreset("test", TOWN_SPLIT["test"], test, sensor_mix=mix),
+            )
+        ),
+        frames=10,
+        lead_frames=0,
+        scene_key="sensor-matrix",
+    )
+
+
+# To be simulated once, for final tables (docs/benchmarks/protocol.md). Strata are splits: they are reported apart.
+_SEALED = replace(
+    _crowded(
+        (
+            SplitPreset("town05", ("Town05",), 40, (16,)),
+            SplitPreset("town10hd", ("Town10HD",), 40, (16,)),
+            SplitPreset("generated", tuple(f"{GENERATED}{seed}" for seed in range(101, 121)), 40, (16,)),
+            SplitPreset(
+                "generated-sensors", tuple(f"{GENERATED}{seed}" for seed in range(121, 141)), 40, sensor_mix="all"
+            ),
+        )
+    ),
+    scene_key="sealed-2026b",
+)
 
 
 # For maps: many places rather than many instants, a second apart; mostly OPV2V's own 64 beams, since paint lies between fewer.
@@ -90,10 +154,11 @@ _STREETS = SimulationPreset(
     ),
     frames=4,
     history_frames=0,
-    rate_hz=1.0,
+    rates_hz=(1.0,),
     vehicles=(3, 5),
     roadside_chance=0.8,
     density=(3.5, 8.0),
+    intensity="material",
 )
 
 _SMOKE_SPLITS = (
@@ -117,6 +182,7 @@ _CROSSING = SimulationPreset(
     roadside_lidar="dair-infrastructure",
     min_vehicles=8,
     layout="dair",
+    intensity="material",
 )
 
 SIMULATION_PRESETS: dict[str, SimulationPreset] = {
@@ -125,16 +191,32 @@ SIMULATION_PRESETS: dict[str, SimulationPreset] = {
     "carla-maps": _STREETS,
     # The same scenes, to the last point of their clouds, with pictures of what lies on the road.
     "carla-maps-camera": replace(_STREETS, cameras="opv2v-road", roadside_cameras="dair-infrastructure-road"),
-    "smoke-opv2v": SimulationPreset(_SMOKE_SPLITS, frames=3, history_frames=1, min_vehicles=4),
+    "smoke-opv2v": SimulationPreset(_SMOKE_SPLITS, frames=3, history_frames=1, min_vehicles=4, intensity="material"),
     "demo": SimulationPreset(
         (SplitPreset("test", ("Town10HD",), 1, (16,)),),
         frames=56,
         vehicles=(3, 3),
         roadside_chance=1.0,
         fallback_town="generated-5",
+        intensity="material",
     ),
     "dair-crossing": _CROSSING,
     "smoke-dair": replace(_CROSSING, splits=_SMOKE_SPLITS, frames=3, min_vehicles=4),
+    "carla-sensors-small": _SENSORS,
+    "carla-beams-16": _one_sensor("beams-16"),
+    "carla-beams-32": _one_sensor("beams-32"),
+    "carla-beams-64": _one_sensor("beams-64"),
+    "carla-beams-128": _one_sensor("beams-128"),
+    # With its own intensity; a few scenes to fine-tune on.
+    "carla-unseen-sensor": replace(
+        _one_sensor("unseen"),
+        splits=(
+            SplitPreset("train", TOWN_SPLIT["train"], 20, sensor_mix="unseen"),
+            *_one_sensor("unseen").splits,
+        ),
+        intensity=None,
+    ),
+    "sealed-2026b": _SEALED,
 }
 
 
@@ -169,11 +251,12 @@ def _lidar_of(name: str, beams: int | None) -> str:
 def make_jobs(preset: SimulationPreset, seed: int, towns: str | None = None) -> list[Job]:
     """Return the scenarios of a preset; each depends on seed, split and its number alone."""
     jobs = []
+    key = (preset.scene_key,) if preset.scene_key else ()
     for part in preset.splits:
         # The folder's name is part of the random key: another name would change every scene.
         folder = SPLIT_FOLDERS.get(part.split, part.split) if preset.layout == "opv2v" else part.split
         for index in range(part.count):
-            random = keyed_generator(seed, "preset", folder, index)
+            random = keyed_generator(seed, "preset", folder, index, *key)
             town = _town_or_fallback(part.towns[index % len(part.towns)], towns, preset.fallback_town)
             beams = part.lidar_beams[index % len(part.lidar_beams)]
             vehicles = int(random.integers(preset.vehicles[0], preset.vehicles[1] + 1))
@@ -185,7 +268,7 @@ def make_jobs(preset: SimulationPreset, seed: int, towns: str | None = None) -> 
                 frames=preset.frames,
                 history_frames=preset.history_frames,
                 lead_frames=preset.lead_frames,
-                rate_hz=preset.rate_hz,
+                rate_hz=preset.rates_hz[index % len(preset.rates_hz)],
                 roadside_chance=1.0 if vehicles == 1 else preset.roadside_chance,
                 lidar=_lidar_of(preset.lidar, beams),
                 roadside_lidar=_lidar_of(preset.roadside_lidar, beams),
@@ -194,6 +277,8 @@ def make_jobs(preset: SimulationPreset, seed: int, towns: str | None = None) -> 
                 clutter=round(float(random.uniform(*preset.clutter)), 3),
                 cameras=preset.cameras,
                 roadside_cameras=preset.roadside_cameras,
+                intensity=preset.intensity,
+                sensor_mix=part.sensor_mix,
             )
             jobs.append(Job(folder, spec, None if town.startswith(GENERATED) else towns))
     return sorted(jobs, key=lambda job: (job.split != "train", job.split != "validate", job.spec.town, job.spec.name))

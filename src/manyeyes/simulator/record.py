@@ -51,10 +51,11 @@ from manyeyes.simulator.folder_state import (
     require_repairable,
     require_sound,
 )
-from manyeyes.simulator.scene.scenario import NoSceneError, ScenarioSpec, SimulatedScenario, make_scenario
+from manyeyes.simulator.scene.scenario import RSU_ID, NoSceneError, ScenarioSpec, SimulatedScenario, make_scenario
 from manyeyes.simulator.scene.towns import load_town
-from manyeyes.simulator.sensors.lidar import lidar_spec
 
+BEFORE_LAWS = {"intensity": "material"}
+"""What a specification stated implicitly before it named an intensity law."""
 _STEP_S = 0.05
 _ATTEMPTS = 40
 JobT = TypeVar("JobT")
@@ -264,7 +265,7 @@ def _finish(job: Job, scenario: SimulatedScenario, draft: Path, points: int) -> 
     """Flush the files of a scenario, and write the one that marks it as finished."""
     files = list_scenario_files(draft)
     digests = digest_files(files, draft)
-    agents = (*scenario.agents, *((-1,) if scenario.roadside is not None else ()))
+    agents = _agents(scenario)
     entry = ManifestEntry(
         split=job.split,
         name=job.spec.name,
@@ -305,23 +306,25 @@ def make_first_scenario(spec: ScenarioSpec, towns: str | None, roadside: bool = 
 def _write(scenario: SimulatedScenario, folder: Path, frames: Collection[int] | None = None) -> int:
     """Write the protocol and these frames, all for None; returns the number of points."""
     spec, points = scenario.spec, 0
-    writer = Opv2vWriter(folder, _STEP_S)
+    # What training draws other intensity laws from must not be rounded.
+    writer = Opv2vWriter(folder, _STEP_S, has_float_intensity=spec.sensor_mix != "none")
     for index in range(len(scenario)) if frames is None else sorted(frames):
         snapshot = scenario.snapshot(index)
         writer.write(snapshot, torch.from_numpy(scenario.states[index].speed))
         points += sum(len(frame.points) for frame in snapshot.frames)
-    sensors = {"vehicle": asdict(lidar_spec(spec.lidar))}
-    if scenario.roadside is not None:
-        sensors["roadside"] = asdict(scenario.roadside.lidar)
     writer.close(
         {
             "history_frames": spec.lead_frames + spec.history_frames,
             "world": {"fixed_delta_seconds": _STEP_S, "town": spec.town, "seed": spec.seed},
             "simulation": asdict(spec),
-            "lidar": sensors,
+            "lidar": {str(agent): scenario.lidar(agent).describe() for agent in _agents(scenario)},
         }
     )
     return points
+
+
+def _agents(scenario: SimulatedScenario) -> tuple[int, ...]:
+    return (*scenario.agents, *((RSU_ID,) if scenario.roadside is not None else ()))
 
 
 def read_finished(path: Path) -> dict[str, Any]:
@@ -329,7 +332,7 @@ def read_finished(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         parse_entry(content)
-        return {**content, "spec": _plain(asdict(ScenarioSpec(**content["spec"])))}
+        return {**content, "spec": _plain(asdict(ScenarioSpec(**{**BEFORE_LAWS, **content["spec"]})))}
     except (ValueError, KeyError, TypeError) as error:
         raise RecordingError(f"{path}: expected what a recording run writes; {error}: remove the folder.") from error
 

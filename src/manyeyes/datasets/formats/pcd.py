@@ -98,11 +98,22 @@ def write_pcd(path: Path, xyz: np.ndarray, intensity: np.ndarray) -> None:
     record = np.empty((n, 4), "<u4")
     record[:, :3] = np.ascontiguousarray(xyz, "<f4").view("<u4")
     record[:, 3] = np.rint(np.clip(intensity, 0, 1) * 255).astype("<u4") << 16
+    _write_four(path, "x y z rgb", record.tobytes(), n)
+
+
+def write_float_pcd(path: Path, xyz: np.ndarray, intensity: np.ndarray) -> None:
+    """Write points (N, 3) and intensities (N,) in [0, 1] as ``x y z intensity``: float32, binary."""
+    record = np.column_stack((xyz, np.clip(intensity, 0, 1))).astype("<f4")
+    _write_four(path, "x y z intensity", record.tobytes(), len(record))
+
+
+def _write_four(path: Path, fields: str, body: bytes, n: int) -> None:
+    """Write n points of four fields of four bytes."""
     header = (
-        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\n"
+        f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {fields}\nSIZE 4 4 4 4\nTYPE F F F F\n"
         f"COUNT 1 1 1 1\nWIDTH {n}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {n}\nDATA binary\n"
     )
-    atomic_write(path, header.encode(), record.tobytes(), durable=False)
+    atomic_write(path, header.encode(), body, durable=False)
 
 
 def write_table(path: Path, table: PcdTable) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from manyeyes.datasets.formats.image_io import write_png
-from manyeyes.datasets.formats.pcd import write_pcd
+from manyeyes.datasets.formats.pcd import write_float_pcd, write_pcd
 from manyeyes.datasets.opv2v.camera import camera_yaml, image_path
 from manyeyes.datasets.opv2v.carla import carla_from_transform, mirror_points, transform_from_carla
 from manyeyes.datasets.opv2v.metadata import KMH_PER_MPS, AgentRecord, write_protocol, write_record
@@ -21,16 +21,20 @@ from manyeyes.datatypes import Boxes, RecordingError, Snapshot, Transform
 class Opv2vWriter:
     """Writes one scenario's folder, so that :class:`Opv2vRecording` reads the same snapshots back.
 
-    Exact to rounding: poses and boxes as float64 text, points as float32, intensity in 8 bits. Not in the format, hence
-    not written: the time of a point, boxes that no agent lists, the covariance of a prior pose. The true pose goes to
-    ``lidar_pose``, the prior one to ``predicted_ego_pos``, which the reader does not use. Snapshots come back with
-    agents in string order of their ids, infrastructure (negative ids) last, and boxes in the order of ids.
+    Exact to rounding: poses and boxes as float64 text, points as float32, intensity in 8 bits as OPV2V has it, or as
+    float32. Not in the format, hence not written: the time of a point, boxes that no agent lists, the covariance of a
+    prior pose. The true pose goes to ``lidar_pose``, the prior one to ``predicted_ego_pos``, which the reader does not
+    use. Snapshots come back with agents in string order of their ids, infrastructure (negative ids) last, and boxes in
+    the order of ids.
     """
 
-    def __init__(self, folder: Path | str, fixed_delta_s: float = 0.05, digits: int = 6) -> None:
+    def __init__(
+        self, folder: Path | str, fixed_delta_s: float = 0.05, digits: int = 6, has_float_intensity: bool = False
+    ) -> None:
         self.folder = Path(folder)
         self._fixed_delta_s = fixed_delta_s
         self._digits = digits
+        self._write_cloud = write_float_pcd if has_float_intensity else write_pcd
         self.folder.mkdir(parents=True, exist_ok=True)
 
     def write(self, snapshot: Snapshot, box_speed_mps: torch.Tensor | None = None) -> None:
@@ -48,7 +52,7 @@ class Opv2vWriter:
             stem = f"{round(steps):0{self._digits}d}"
             xyz = mirror_points(frame.points.xyz.numpy())
             xyz[:, 2] -= np.float32(frame.sensor_height_m)
-            write_pcd(folder / f"{stem}.pcd", xyz, frame.points.intensity.numpy())
+            self._write_cloud(folder / f"{stem}.pcd", xyz, frame.points.intensity.numpy())
             record, cameras = _record_of(snapshot, row, box_speed_mps), {}
             true_pose = transform_from_carla(record.ego_pose), transform_from_carla(record.lidar_pose)
             for number, image in enumerate(frame.images):

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from manyeyes.datatypes import LABELS, AgentFrame, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.maps.roads.road_network import Junction, RoadNetwork
 from manyeyes.ops.keyed_random import keyed_generator
+from manyeyes.ops.lidar.intensity import INTENSITY_LAWS
 from manyeyes.ops.raycast import HeightField, Primitives
 from manyeyes.simulator.scene.ground import GroundRaster, build_ground, is_multilevel
 from manyeyes.simulator.scene.parking import parked_cars
@@ -33,9 +34,12 @@ from manyeyes.simulator.scene.vehicle_shapes import (
 )
 from manyeyes.simulator.scene.vehicles import VehicleStates
 from manyeyes.simulator.sensors.camera import CameraSpec, LitScene, camera_rig, render_image
-from manyeyes.simulator.sensors.lidar import LidarSpec, RaycastScene, lidar_spec, scan
+from manyeyes.simulator.sensors.lidar import RaycastScene, scan
+from manyeyes.simulator.sensors.lidar_spec import LidarSpec
+from manyeyes.simulator.sensors.lidars import lidar_spec
 from manyeyes.simulator.sensors.lighting import draw_light
 from manyeyes.simulator.sensors.materials import Materials, make_static_materials, make_vehicle_materials
+from manyeyes.simulator.sensors.sensor_mix import sensor_mix
 
 Array = NDArray[np.float64]
 
@@ -56,7 +60,8 @@ class ScenarioSpec:
     road yet: then others are drawn. roadside_chance: probability of a roadside unit. density: of the traffic, in units of 9
     vehicles per kilometre of lane. min_vehicles: within 60 m of the crossing, or another crossing is drawn. clutter: factor on
     the numbers of RoadsideObjectSpec. cameras, roadside_cameras: names of CAMERA_RIGS, of each vehicle and of the unit, at its
-    LiDAR's height.
+    LiDAR's height. intensity: a name of INTENSITY_LAWS, of all sensors; None for each sensor's own law. sensor_mix: a name of
+    SENSOR_MIXES, from which the sensor of each agent is drawn; "none" for lidar and roadside_lidar as they are.
     """
 
     town: str
@@ -78,6 +83,8 @@ class ScenarioSpec:
     clutter: float = 1.0
     cameras: str = "none"
     roadside_cameras: str = "none"
+    intensity: str | None = None
+    sensor_mix: str = "none"
 
     def __post_init__(self) -> None:
         if not (1 <= self.vehicles <= 6 and self.frames > self.history_frames >= 0 <= self.lead_frames):
@@ -86,6 +93,16 @@ class ScenarioSpec:
             )
         if not 0 <= self.low_m < self.high_m:
             raise ConfigError(f"ScenarioSpec needs 0 <= low_m < high_m; got {self}.")
+        if self.intensity is not None and self.intensity not in INTENSITY_LAWS:
+            raise ConfigError(f"No intensity law '{self.intensity}'; choose one of {', '.join(INTENSITY_LAWS)}.")
+
+    def agent_lidar(self, agent: int) -> LidarSpec:
+        """Return the sensor of a vehicle, or of the roadside unit (agent < 0), with its mounting and its law."""
+        if self.sensor_mix == "none":
+            lidar = lidar_spec(self.roadside_lidar if agent < 0 else self.lidar)
+        else:
+            lidar = sensor_mix(self.sensor_mix).draw(agent < 0, self.rate_hz, (self.seed, self.name, agent))
+        return lidar if self.intensity is None else replace(lidar, intensity=INTENSITY_LAWS[self.intensity])
 
 
 class NoSceneError(ConfigError):
@@ -94,7 +111,7 @@ class NoSceneError(ConfigError):
 
 @dataclass(frozen=True, eq=False)
 class RoadsideUnit:
-    """A unit on a pole: its upright frame on the road under it, facing the crossing, and its sensors."""
+    """A unit on a pole: its upright frame on the road under it, facing the crossing, and its sensors, which may be tilted."""
 
     world_from_agent: Transform
     lidar: LidarSpec
@@ -125,6 +142,10 @@ class SimulatedScenario:
         """Share of the first frame's vehicles that are elsewhere in the last; frames of the lead do not count."""
         return float(_find_moving(self.states[self.spec.lead_frames :]).mean())
 
+    def lidar(self, agent: int) -> LidarSpec:
+        """Return the sensor of an agent."""
+        return self.roadside.lidar if agent < 0 and self.roadside is not None else self.spec.agent_lidar(agent)
+
     def snapshot(self, index: int) -> Snapshot:
         """What every agent senses at one instant, and the truth: prior poses are the true ones."""
         states, spec = self.states[index], self.spec
@@ -136,10 +157,9 @@ class SimulatedScenario:
         frames, visible = [], []
         for agent in self.agents:
             row = int(np.flatnonzero(states.id == agent)[0])
-            pose = _pose(states, row)
             speed = float(states.speed[row])
             frame, own_visible = self._sense(
-                scene, agent, pose, lidar_spec(spec.lidar), boxes, (time_ns, drawn_ms), speed
+                scene, agent, _pose(states, row), self.lidar(agent), boxes, (time_ns, drawn_ms), speed
             )
             frames.append(_with_images(frame, lit_scene, rig))
             visible.append(own_visible)
@@ -176,16 +196,21 @@ class SimulatedScenario:
         self,
         scene: RaycastScene,
         agent: int,
-        pose: Transform,
+        mount: Transform,
         lidar: LidarSpec,
         boxes: Boxes,
         time: tuple[int, int],
         speed: float,
     ) -> tuple[AgentFrame, torch.Tensor]:
-        """Return one agent's frame, and which boxes it sees. time: its own in ns, and that which draws are keyed by in ms."""
+        """Return one agent's frame, and which boxes it sees.
+
+        mount: the frame on the road that its sensor stands on; the agent's frame is tilted as the sensor is. time: its own in ns,
+        and that which draws are keyed by in ms.
+        """
         time_ns, drawn_ms = time
-        key = (self.spec.seed, self.spec.name, drawn_ms, agent)
-        points, instance = scan(scene, pose, lidar, key, own=agent)
+        seed, name = self.spec.seed, self.spec.name
+        pose = lidar.agent_pose(mount)
+        points, instance = scan(scene, pose, lidar, (seed, name, drawn_ms, agent), agent, (seed, name, "sensor", agent))
         frame = AgentFrame(
             agent_id=agent,
             timestamp_ns=time_ns,
@@ -374,5 +399,8 @@ def _roadside(
     toward = middle - xy
     pose = Transform.from_xyz_yaw(float(xy[0]), float(xy[1]), float(plot.height(xy)), math.atan2(toward[1], toward[0]))
     height = float(random.uniform(4.5, 6.0))
-    cameras = tuple(replace(camera, z_m=height) for camera in camera_rig(spec.roadside_cameras))
-    return RoadsideUnit(pose, replace(lidar_spec(spec.roadside_lidar), height_m=height), cameras)
+    lidar = spec.agent_lidar(RSU_ID)
+    if spec.sensor_mix == "none":
+        lidar = replace(lidar, height_m=height)
+    cameras = tuple(replace(camera, z_m=lidar.height_m) for camera in camera_rig(spec.roadside_cameras))
+    return RoadsideUnit(pose, lidar, cameras)

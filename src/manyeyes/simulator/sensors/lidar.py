@@ -8,8 +8,7 @@ nor the traffic moves within the sweep.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -17,97 +16,19 @@ import torch
 from numpy.typing import NDArray
 
 from manyeyes._jit import F32x2, F64x1, F64x2, I32x2, I64x1, U8x2, njit
-from manyeyes.datatypes import ConfigError, PointCloud, Transform
+from manyeyes.datatypes import PointCloud, Transform
 from manyeyes.ops.keyed_random import keyed_generator
+from manyeyes.ops.lidar.intensity import ATTENUATION_PER_M, compute_intensity
 from manyeyes.ops.raycast import GROUND, NOTHING, HeightField, Primitives, SensorPose, cast_rays
+from manyeyes.simulator.sensors.lidar_spec import BeamUnit, LidarSpec
 
 OFF_ROAD, ASPHALT, PAINT, SIDEWALK, CROSSING = range(5)
 
 # Chosen: near-infrared (905 nm) reflectances of grass and soil, worn asphalt, white thermoplastic, concrete, paint on worn asphalt.
 SURFACE_REFLECTIVITY = np.array([0.28, 0.12, 0.75, 0.32, 0.62])
 
-# CARLA's sensor attenuates intensity by exp(-a r) with a = 0.004 / m, and OPV2V's clouds carry it (recordings.md).
-ATTENUATION = 0.004
-
-
-@dataclass(frozen=True)
-class LidarSpec:
-    """A sensor that spins about its upright axis.
-
-    beams: spread evenly over elevations lower_rad … upper_rad. per_turn: azimuths of a whole turn; sector_rad: the width,
-    centred ahead, of what is kept of it. height_m: above the road. range_sigma_m: noise along the ray. A return is lost
-    with probability drop_general + drop_dark * max(0, 1 - s / drop_limit) + drop_grazing * max(0, 1 - cos / 0.1), where
-    s = exp(-0.004 r) is CARLA's signal (the first two terms are CARLA's) and cos that of the incidence.
-    """
-
-    beams: int = 64
-    per_turn: int = 1800
-    lower_rad: float = math.radians(-25)
-    upper_rad: float = math.radians(2)
-    sector_rad: float = 2 * math.pi
-    max_range_m: float = 120.0
-    height_m: float = 1.9
-    range_sigma_m: float = 0.02
-    drop_general: float = 0.1
-    drop_dark: float = 0.15
-    drop_limit: float = 0.7
-    drop_grazing: float = 0.3
-    rate_hz: float = 10.0
-
-    def __post_init__(self) -> None:
-        if self.beams < 2 or self.per_turn < 8 or self.lower_rad >= self.upper_rad or self.max_range_m <= 0:
-            raise ConfigError(
-                f"LidarSpec needs beams >= 2, per_turn >= 8, lower_rad < upper_rad, max_range_m > 0; got {self}."
-            )
-
-    @cached_property
-    def elevation(self) -> NDArray[np.float64]:
-        """Elevation angles (B,) of the beams in radians, ascending."""
-        return np.linspace(self.lower_rad, self.upper_rad, self.beams)
-
-    @cached_property
-    def azimuth(self) -> NDArray[np.float64]:
-        """Azimuth angles (A,) of the firings in radians, counter-clockwise."""
-        all_of_them = -math.pi + 2 * math.pi * (np.arange(self.per_turn) + 0.5) / self.per_turn
-        return all_of_them[np.abs(all_of_them) <= self.sector_rad / 2]
-
-
-# opv2v: CARLA's sensor in OPV2V's scenes: 64 channels, +2 to -25 degrees, 120 m, 1.3 million points a second at 20 turns,
-# which is 1,016 azimuths; drop-off 0.1 / 0.15 / 0.7 and 2 cm noise as in that configuration.
-# opv2v-32, opv2v-16: the same with every second and every fourth beam, as cheaper sensors are built.
-# dair-vehicle: chosen, after a 40-beam roof sensor (40 beams, 0.2 degrees, denser towards the horizon there, even here).
-# dair-infrastructure: chosen, after a 300-line solid-state sensor with 100 degrees ahead, x >= 0 only, 280 m there.
-# The others are the 115,200-ray sensor of the benchmarks, and OPV2V's sensor on a pole, tilted down (chosen).
-_OPV2V = LidarSpec(per_turn=1016, drop_general=0.17)
-_OPV2V_ROADSIDE = replace(_OPV2V, lower_rad=math.radians(-32), upper_rad=0.0, height_m=5.0)
-
-LIDAR_PRESETS: dict[str, LidarSpec] = {
-    "spinning-64": LidarSpec(),
-    "opv2v": _OPV2V,
-    "opv2v-32": replace(_OPV2V, beams=32),
-    "opv2v-16": replace(_OPV2V, beams=16),
-    "opv2v-roadside": _OPV2V_ROADSIDE,
-    "opv2v-roadside-32": replace(_OPV2V_ROADSIDE, beams=32),
-    "opv2v-roadside-16": replace(_OPV2V_ROADSIDE, beams=16),
-    "dair-vehicle": LidarSpec(beams=40, lower_rad=math.radians(-16), upper_rad=math.radians(7), height_m=1.9),
-    "dair-infrastructure": LidarSpec(
-        beams=300,
-        per_turn=1800,
-        lower_rad=math.radians(-34),
-        upper_rad=math.radians(6),
-        sector_rad=math.radians(100),
-        max_range_m=200.0,
-        height_m=6.0,
-        drop_general=0.05,
-    ),
-}
-
-
-def lidar_spec(name: str) -> LidarSpec:
-    """Return a sensor by its name in LIDAR_PRESETS."""
-    if name not in LIDAR_PRESETS:
-        raise ConfigError(f"No LiDAR '{name}'; choose one of {', '.join(LIDAR_PRESETS)}.")
-    return LIDAR_PRESETS[name]
+# Spurious returns of the air: mean range in metres, and reflectivity (chosen).
+_AIR_RANGE_M, _AIR_REFLECTIVITY = 8.0, 0.1
 
 
 @dataclass(frozen=True)
@@ -146,20 +67,24 @@ class _TargetArrays(NamedTuple):
 
 
 class _Draws(NamedTuple):
-    """Random numbers of each ray (A, B): a standard normal and a uniform one."""
+    """Random numbers of each ray (A, B): a standard normal, a uniform one, and a uniform one of the air, (0, 0) in clear air."""
 
     noise: F32x2
     uniform: F32x2
+    air: F32x2
 
 
 class _ReturnModel(NamedTuple):
-    """Noise and drop-out of :class:`LidarSpec`, its height in metres, and the period of a turn in seconds."""
+    """Noise and drop-out of :class:`LidarSpec`, the head's height in metres, and the period of a turn in seconds."""
 
     range_sigma_m: float
     drop_general: float
     drop_dark: float
     drop_limit: float
     drop_grazing: float
+    spurious_fraction: float
+    min_range_m: float
+    range_10_percent_m: float
     height_m: float
     period_s: float
 
@@ -168,76 +93,114 @@ class _ReturnModel(NamedTuple):
 def _assemble(
     hits: _HitArrays, rays: _Directions, targets: _TargetArrays, draws: _Draws, spec: _ReturnModel
 ) -> tuple[F32x2, I64x1]:
-    """Kept returns as rows x, y, z (agent frame), intensity, time (K, 5), and their instances (K,)."""
+    """Kept returns as rows x, y, z (agent frame), material intensity, time, reflectivity, range (K, 7), and instances (K,)."""
     depth, owner, cosine, surface = hits
     cos_el, sin_el, cos_az, sin_az, turned = rays
     reflectivity, surface_reflectivity, instance = targets
-    noise, luck = draws
-    sigma, general, dark, limit, grazing, height, period = spec
+    noise, luck, air = draws
+    sigma, general, dark, limit, grazing, spurious, nearest, range_10, height, period = spec
     count = 0
-    out, who = np.empty((depth.size, 5), np.float32), np.empty(depth.size, np.int64)
+    out, who = np.empty((depth.size, 7), np.float32), np.empty(depth.size, np.int64)
     for a in range(depth.shape[0]):
         for b in range(depth.shape[1]):
             index = owner[a, b]
-            if index == NOTHING:
+            t, is_air = depth[a, b], False
+            if spurious > 0 and air[a, b] < spurious:
+                in_air = nearest - _AIR_RANGE_M * math.log(1.0 - air[a, b] / spurious)
+                if in_air < t:
+                    t, is_air = in_air, True
+            if (index == NOTHING and not is_air) or t < nearest:
                 continue
-            t = depth[a, b]
-            signal = math.exp(-ATTENUATION * t)
-            lost = general + dark * max(0.0, 1.0 - signal / limit) + grazing * max(0.0, 1.0 - cosine[a, b] / 0.1)
+            signal = math.exp(-ATTENUATION_PER_M * t)
+            if is_air:
+                lost, bright = general, _AIR_REFLECTIVITY
+            else:
+                lost = general + dark * max(0.0, 1.0 - signal / limit) + grazing * max(0.0, 1.0 - cosine[a, b] / 0.1)
+                bright = surface_reflectivity[surface[a, b]] if index == GROUND else reflectivity[index]
+                bright *= 0.5 + 0.5 * math.sqrt(cosine[a, b])
+                if range_10 > 0 and bright * range_10 * range_10 < 0.1 * t * t:
+                    continue
             if luck[a, b] < lost:
                 continue
-            bright = surface_reflectivity[surface[a, b]] if index == GROUND else reflectivity[index]
+            true_range = t
             t += sigma * noise[a, b]
             out[count, 0] = t * cos_el[b] * cos_az[a]
             out[count, 1] = t * cos_el[b] * sin_az[a]
             out[count, 2] = t * sin_el[b] + height
-            out[count, 3] = min(1.0, max(0.0, bright * (0.5 + 0.5 * math.sqrt(cosine[a, b])) * signal))
+            out[count, 3] = min(1.0, max(0.0, bright * signal))
             out[count, 4] = (turned[a] - 1.0) * period
-            who[count] = 0 if index == GROUND else instance[index]
+            out[count, 5] = bright
+            out[count, 6] = true_range
+            who[count] = 0 if index == GROUND or is_air else instance[index]
             count += 1
     return out[:count].copy(), who[:count].copy()
 
 
 def scan(
-    scene: RaycastScene, world_from_agent: Transform, spec: LidarSpec, key: tuple[int | str, ...], own: int = 0
+    scene: RaycastScene,
+    world_from_agent: Transform,
+    spec: LidarSpec,
+    key: tuple[int | str, ...],
+    own: int = 0,
+    sensor_key: tuple[int | str, ...] = (),
 ) -> tuple[PointCloud, NDArray[np.int64]]:
     """Return one sweep from a sensor spec.height_m above the road: the cloud in the agent's frame, and the instance of each
     return.
 
-    own: the instance that carries the sensor, which is not met. key: the same key gives the same noise, drop-out and foliage.
+    Args:
+        scene: what rays can meet.
+        world_from_agent: pose of the agent's frame, whose axes are the sensor's: a tilt is part of it (LidarSpec.agent_pose).
+        spec: the sensor.
+        key: the same key gives the same noise, drop-out and foliage.
+        own: the instance that carries the sensor, which is not met.
+        sensor_key: of what stays the same in all sweeps of this sensor, the gains of its beams.
     """
     random = keyed_generator(*key, "lidar")
-    rotation = np.ascontiguousarray(world_from_agent.rotation.numpy(), np.float64)
-    origin = world_from_agent.translation.numpy() + spec.height_m * rotation[:, 2]
     solids = scene.solids[(scene.solids.instance != own) | (scene.solids.instance == 0)] if own else scene.solids
+    visible = RaycastScene(solids, scene.ground)
+    parts = [_scan_unit(visible, world_from_agent, spec, unit, random) for unit in spec.units]
+    rows = parts[0][0] if len(parts) == 1 else np.concatenate([part[0] for part in parts])
+    instance = parts[0][1] if len(parts) == 1 else np.concatenate([part[1] for part in parts])
+    cloud = torch.from_numpy(rows)
+    xyz, time_s = cloud[:, :3].contiguous(), cloud[:, 4].contiguous()
+    if spec.intensity.kind == "material":
+        return PointCloud(xyz, cloud[:, 3].contiguous(), time_s), instance
+    elevation = torch.atan2(xyz[:, 2] - spec.height_m, xyz[:, :2].norm(dim=1))
+    draws = key if spec.intensity.kind in ("noise", "shuffled") else sensor_key
+    intensity = compute_intensity(spec.intensity, cloud[:, 5], cloud[:, 6], elevation, draws)
+    return PointCloud(xyz, intensity, time_s), instance
+
+
+def _scan_unit(
+    scene: RaycastScene, world_from_agent: Transform, spec: LidarSpec, unit: BeamUnit, random: np.random.Generator
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Return the rows and instances of the returns of one head; see :func:`_assemble`."""
+    rotation = np.ascontiguousarray(world_from_agent.rotation.numpy(), np.float64)
+    height = spec.height_m + unit.offset_m
+    origin = world_from_agent.translation.numpy() + height * rotation[:, 2]
+    azimuth, elevation = spec.azimuth, unit.elevation
     foliage = int(random.integers(2**63))
-    hits = cast_rays(
-        solids,
-        scene.ground,
-        SensorPose(origin, rotation),
-        spec.elevation,
-        spec.azimuth,
-        spec.per_turn,
-        spec.max_range_m,
-        foliage,
-    )
+    pose = SensorPose(origin, rotation)
+    hits = cast_rays(scene.solids, scene.ground, pose, elevation, azimuth, spec.per_turn, spec.max_range_m, foliage)
     shape = hits.range_m.shape
-    azimuth, elevation = spec.azimuth, spec.elevation
     turn_fraction = (azimuth + math.pi) / (2 * math.pi)
-    rows, instance = _assemble(
+    noise, uniform = random.standard_normal(shape, np.float32), random.random(shape, np.float32)
+    air = random.random(shape if spec.spurious_fraction else (0, 0), np.float32)
+    return _assemble(
         _HitArrays(hits.range_m, hits.primitive, hits.cosine, hits.surface),
         _Directions(np.cos(elevation), np.sin(elevation), np.cos(azimuth), np.sin(azimuth), turn_fraction),
-        _TargetArrays(solids.reflectivity, SURFACE_REFLECTIVITY, solids.instance),
-        _Draws(random.standard_normal(shape, np.float32), random.random(shape, np.float32)),
+        _TargetArrays(scene.solids.reflectivity, SURFACE_REFLECTIVITY, scene.solids.instance),
+        _Draws(noise, uniform, air),
         _ReturnModel(
             spec.range_sigma_m,
             spec.drop_general,
             spec.drop_dark,
             spec.drop_limit,
             spec.drop_grazing,
-            spec.height_m,
+            spec.spurious_fraction,
+            spec.min_range_m,
+            spec.range_10_percent_m,
+            height,
             1.0 / spec.rate_hz,
         ),
     )
-    cloud = torch.from_numpy(rows)
-    return PointCloud(cloud[:, :3].contiguous(), cloud[:, 3].contiguous(), cloud[:, 4].contiguous()), instance
