@@ -69,7 +69,7 @@ def test_run_writes_table_pictures_animation_report_and_json(data, weights, tmp_
     assert all(name in output.out for name in ("none", "late", "intermediate", "early", "report.html"))
     made = {p.name for p in tmp_path.iterdir()}
     pictures = {f"{name}.png" for name in ("none", "late", "intermediate", "early")}
-    assert made == pictures | {"drive.gif", "report.html", "results.json", "results.md"}
+    assert made == pictures | {"reliability.png", "drive.gif", "report.html", "results.json", "results.md"}
     held = json.loads((tmp_path / "results.json").read_text())
     assert [n["method"] for n in held["result"]["stats"]] == ["none", "late", "intermediate", "early"]
     assert held["provenance"]["config"]["detector"]["pillar_channels"] == COSTR_TINY.pillar_channels
@@ -79,7 +79,7 @@ def test_run_writes_table_pictures_animation_report_and_json(data, weights, tmp_
     with Image.open(tmp_path / "drive.gif") as film:
         assert film.n_frames == 2
     report = (tmp_path / "report.html").read_text()
-    assert report.count("data:image/") == 5
+    assert report.count("data:image/") == 6
     assert " --split test --scenario " in report
 
 
@@ -232,6 +232,21 @@ def test_train_runs_a_plan_on_a_mixture_and_goes_on_with_it(data, tmp_path) -> N
     before = checkpoint.load(out / "weights.safetensors").fingerprint
     assert run(*command) == 0
     assert checkpoint.load(out / "weights.safetensors").fingerprint == before
+
+
+@pytest.mark.slow
+def test_calibrate_adds_maps_and_keeps_the_weights(data, weights, tmp_path, capsys) -> None:
+    out = tmp_path / "calibrated.safetensors"
+    words = ("--weights", weights, "--data", data, "--split", "test", "--max-frames", 2)
+    assert run("calibrate", *words, "--out", out) == 0
+    assert "fused: " in capsys.readouterr().out
+    before, after = checkpoint.load(weights), checkpoint.load(out)
+    assert after.fingerprint == before.fingerprint and before.score_calibration is None
+    assert after.score_calibration is not None and after.score_calibration.fused is not None
+    card = checkpoint.read_card(out)
+    assert card["calibrated_on"]["command"] and set(card["calibrated_on"]["boxes"]) == {"own", "late", "early", "fused"}
+    assert run("calibrate", *words[:1], out, *words[2:], "--out", out) == 0
+    assert checkpoint.load(out).score_calibration == after.score_calibration
 
 
 def test_train_needs_one_weight_a_recording(data, capsys) -> None:

@@ -127,6 +127,16 @@ def test_a_plan_begins_from_given_weights_and_refuses_those_of_another_run(toy, 
         PlanRun(plan, road(toy), 0, tmp_path / "run", tmp_path / "b.safetensors").run()
 
 
+@pytest.mark.slow
+def test_scores_are_calibrated_on_the_recording_of_validation(finished, toy, tmp_path):
+    for name in ("one", "two", "codebook"):
+        shutil.copytree(finished / name, tmp_path / name)
+    weights = PlanRun(PLAN, road(toy), 5, tmp_path, validation=road(toy)).run()
+    detector, plain = checkpoint.load(weights), checkpoint.load(finished / "weights.safetensors")
+    assert detector.score_calibration is not None and plain.score_calibration is None
+    assert detector.fingerprint == plain.fingerprint and checkpoint.read_card(weights)["steps"] == 5
+
+
 @pytest.mark.parametrize("name", [name for name in TRAINING_PLANS if not name.startswith("costr-tiny")])
 def test_the_last_stages_of_plans_that_ship_mix_sensors(name):
     assert all(config.augment.sensors is not None for _, config in TRAINING_PLANS[name].stages[-2:])

@@ -40,6 +40,7 @@ from manyeyes.comms.token_selection import select_within_budget
 from manyeyes.comms.wire import TokenEncoding
 from manyeyes.datatypes import AgentFrame, Boxes, Message, SparseBev
 from manyeyes.models.detector.protocols import BoxDetector, check_detector, require_tokens
+from manyeyes.models.score_calibration import calibrate_boxes
 
 if TYPE_CHECKING:
     from manyeyes.agents.map_perception import MapPredictor
@@ -51,9 +52,9 @@ EGO_HALF_SIZE_M = (2.6, 1.3)
 class Perception:
     """Result of one perception.
 
-    boxes: in the agent's frame, by falling score. received: the fused messages by agent id, with their corrected poses.
-    corrections: one for each received message, where the agent corrects poses, between levelled frames. rejected: senders whose
-    content was excluded, wholly or in part, with the reason.
+    boxes: in the agent's frame, by falling score, which is calibrated where the weights are (``models.score_calibration``).
+    received: the fused messages by agent id, with their corrected poses. corrections: one for each received message, where the
+    agent corrects poses, between levelled frames. rejected: senders whose content was excluded, wholly or in part, with the reason.
     """
 
     boxes: Boxes
@@ -204,7 +205,7 @@ class Agent:
         rejected = [
             rejection for rejection in rejected if rejection.reason != "pose" or rejection.agent_id not in fused
         ]
-        boxes = perception.boxes
+        boxes = calibrate_boxes(self.perception_cache.detector, self.strategy.score_form, perception.boxes)
         if level.levelled_from_agent is not None:
             boxes = boxes.transform(level.levelled_from_agent.inverse())
         return replace(perception, boxes=boxes, rejected=(*rejected, *left_out, *failed))

@@ -39,8 +39,8 @@ class Options:
     """At most so many evaluated frames, instead of all."""
     animate: bool = True
     """Draw the animation of the drive."""
-    min_score: Fraction = 0.4
-    """Detections below this score are not drawn; they count all the same."""
+    min_score: Fraction | None = None
+    """Detections below this score are not drawn; they count all the same. By default that of the weights; 0.4 if uncalibrated."""
     replay_options: ReplayOptions = field(default_factory=lambda: ReplayOptions(channel="its-g5-27mbps"))
     """How agents collaborate."""
 

@@ -19,6 +19,7 @@ COMMANDS = {
     "simulate": "simulate scenes from a seed, in OPV2V's layout",
     "train": "train a detector on recordings: one stage, or all from nothing to what ships",
     "fit-codebook": "fit the codebook that quantises the tokens of trained weights",
+    "calibrate": "calibrate the scores of trained weights, and with them the score from which boxes are drawn",
     "evaluate": "evaluate methods on a split: AP with intervals, bytes, paired differences",
     "replay": "replay your own recording as demo does",
     "view": "draw a frame of a recording, or animate a drive",

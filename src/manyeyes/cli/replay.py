@@ -32,8 +32,8 @@ class Options:
     """Of the channel's losses and jitter."""
     animate: bool = True
     """Draw the animation of the drive."""
-    min_score: Fraction = 0.4
-    """Detections below this score are not drawn; they count all the same."""
+    min_score: Fraction | None = None
+    """Detections below this score are not drawn; they count all the same. By default that of the weights; 0.4 if uncalibrated."""
     replay_options: ReplayOptions = field(default_factory=ReplayOptions)
     """How agents collaborate."""
     checks: FileChecks = field(default_factory=FileChecks)

@@ -45,6 +45,10 @@ class Options:
     """Which split of every dataset: a folder inside it."""
     data_weights: tuple[PositiveFloat, ...] = ()
     """Probability that a sample comes from each of the recordings, up to a common factor, instead of by numbers of scenarios."""
+    validation: tuple[Path, ...] = ()
+    """Recordings that a plan calibrates scores on, whose frames are in no training; without any, scores stay as they are."""
+    validation_split: str | None = "val"
+    """Which split of every recording of validation."""
     preset: str = "costr-small/stage1"
     """Settings by name, of a stage or of a plan of stages; an unknown name lists the known ones."""
     out: OutputFolder | None = None
@@ -226,6 +230,7 @@ def _train_plan(
     """Run what is left of a plan, with a progress bar for each stage that is trained now."""
     from contextlib import ExitStack
 
+    from manyeyes.datasets.mixed import open_recordings
     from manyeyes.models import checkpoint, pretrained
     from manyeyes.training.detector.plan import PlanRun
     from manyeyes.training.trainer import Progress
@@ -244,7 +249,8 @@ def _train_plan(
         given = next(iter(map(str, options.weights)), plan.start)
         start = files.enter_context(pretrained.open_detector_file(given)) if given else None
         card = {**_make_card(options, plan), "preset": options.preset, "data": [str(path) for path in options.data]}
-        weights = PlanRun(plan, recording, options.seed, out, start).run(card, report)
+        validation = open_recordings(options.validation, options.validation_split) if options.validation else None
+        weights = PlanRun(plan, recording, options.seed, out, start, validation).run(card, report)
     seconds = checkpoint.read_card(weights)["train_seconds"]
     folders = tuple(out / name for name, _ in plan.stages if (out / name / "log.jsonl").exists())
     return _FinishedRun(plan, weights, last.loss if last else None, seconds, folders)

@@ -46,8 +46,8 @@ class Options:
     """Of the picture, pixels."""
     detect: str | None = None
     """Also draw what one method finds: none, late, intermediate or early."""
-    min_score: Fraction = 0.4
-    """Detections below this score are not drawn."""
+    min_score: Fraction | None = None
+    """Detections below this score are not drawn; by default that of the weights, 0.4 if they are uncalibrated."""
     replay_options: ReplayOptions = field(default_factory=ReplayOptions)
     """How agents collaborate, with --detect."""
 
@@ -94,23 +94,27 @@ def _draw_images(options: Options, drive: Excerpt, indices: range, config: Repla
 
     snapshots = [drive.snapshot(drive.scenario, i) for i in (indices or (indices.start,))]
     grid = BevGrid(-options.half_extent_m[0], -options.half_extent_m[1], -5.0, *options.half_extent_m, 6.0)
-    detections = [Boxes.empty()] * len(snapshots)
+    detections, min_score = [Boxes.empty()] * len(snapshots), options.min_score or 0.0
     if config is not None:
-        grid, detections = _run_detector(options, config, snapshots)
+        grid, min_score, detections = _run_detector(options, config, snapshots)
     images = []
     for snapshot, boxes in zip(snapshots, detections):
         caption = f"frame {snapshot.index} · {len(snapshot.frames)} agents"
         caption += f" · {options.detect} with {options.replay_options.weights}" if options.detect else ""
         scene = make_scene(snapshot, boxes)
-        images.append(draw_scene(scene, grid, drive.scenario, caption, options.width, options.min_score))
+        images.append(draw_scene(scene, grid, drive.scenario, caption, options.width, min_score))
     return images
 
 
-def _run_detector(options: Options, config: ReplayConfig, snapshots: list[Snapshot]) -> tuple[BevGrid, list[Boxes]]:
-    """Return the detector's range, and what the ego finds at each instant."""
+def _run_detector(
+    options: Options, config: ReplayConfig, snapshots: list[Snapshot]
+) -> tuple[BevGrid, float, list[Boxes]]:
+    """Return the detector's range, the minimum score of drawn boxes, and what the ego finds at each instant."""
     from manyeyes.agents.replay import DetectionReplay
     from manyeyes.models import pretrained
+    from manyeyes.studies.replay_report import find_min_score
 
     detector = pretrained.load(options.replay_options.weights)
     player = DetectionReplay(str(options.detect), detector, config)
-    return detector.detection_range, [step.boxes for snapshot in snapshots for step in player.step(snapshot)]
+    boxes = [step.boxes for snapshot in snapshots for step in player.step(snapshot)]
+    return detector.detection_range, find_min_score(detector, str(options.detect), options.min_score), boxes

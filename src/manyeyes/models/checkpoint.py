@@ -25,6 +25,7 @@ from manyeyes._io import atomic_write, parse_json
 from manyeyes.datatypes import BevGrid, CheckpointError, ConfigError
 from manyeyes.datatypes.errors import shorten
 from manyeyes.models.detector.detector import Detector, DetectorConfig
+from manyeyes.models.score_calibration import read_score_calibration
 from manyeyes.models.token_peaks import read_token_peaks
 
 FORMAT = "manyeyes-detector-1"
@@ -146,7 +147,9 @@ def load(path: Path) -> Detector:
     """Load a detector in evaluation mode."""
     model = load_as(path, FORMAT, DetectorConfig, Detector)
     model.fingerprint = fingerprint(model)
-    model.token_peaks = read_token_peaks(read_card(path), model.token_channels, path)
+    card = read_card(path)
+    model.token_peaks = read_token_peaks(card, model.token_channels, path)
+    model.score_calibration = read_score_calibration(card, path)
     return model
 
 

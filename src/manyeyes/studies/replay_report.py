@@ -12,18 +12,21 @@ from rich.console import Console
 
 from manyeyes._io import atomic_write_text
 from manyeyes.agents.replay import ReplayConfig, ReplayStep, replay
+from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.datasets.missing import NONE_MISSING, MissingFiles
 from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.evaluation.detection.accumulator import MetricAccumulator
 from manyeyes.evaluation.detection.average_precision import DetectionProtocol, get_protocol
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.protocols import BoxDetector
+from manyeyes.models.score_calibration import default_drawing_score
 from manyeyes.studies import provenance
 from manyeyes.studies.replay_options import Excerpt
 from manyeyes.viz.animation import save_animation, stack_images
 from manyeyes.viz.birds_eye import draw_scene, make_scene, save_png
 from manyeyes.viz.pose_summary import HEADINGS, PoseCorrectionSummary
 from manyeyes.viz.progress import make_progress_bars
+from manyeyes.viz.reliability import make_reliability_chapter
 from manyeyes.viz.report import Chapter, HtmlReport, ReportImage, save_report
 from manyeyes.viz.results import MethodComparison, print_comparison, summarize_comparison
 from manyeyes.viz.table import format_markdown
@@ -44,7 +47,11 @@ TITLES = {
 
 @dataclass(frozen=True)
 class ReportSpec:
-    """What is shown and where it goes. frame: index of the pictured instant, None: the middle one. missing: files of the drive."""
+    """What is shown and where it goes.
+
+    min_score: of drawn boxes; None: that of the weights. frame: index of the pictured instant, None: the middle one. missing: files
+    of the drive.
+    """
 
     out: Path
     title: str
@@ -52,7 +59,7 @@ class ReportSpec:
     methods: tuple[str, ...]
     replay: ReplayConfig
     weights: str
-    min_score: float = 0.4
+    min_score: float | None = None
     frame: int | None = None
     animate: bool = True
     facts: tuple[tuple[str, str], ...] = ()
@@ -84,6 +91,7 @@ def replay_and_report(drive: Excerpt, detector: BoxDetector, spec: ReportSpec, c
         valid_range = f"{eval_indices.start} to {eval_indices[-1]}"
         raise ConfigError(f"Frame {pictured_index} of {drive.scenario} is not evaluated; choose one of {valid_range}.")
     grid, protocol = detector.detection_range, make_protocol(detector)
+    min_scores = {name: find_min_score(detector, name, spec.min_score) for name in spec.methods}
     metrics = {name: MetricAccumulator(name, protocol) for name in spec.methods}
     film = _Film(_select_animated(spec.methods) if spec.animate else ())
     pictured_steps: list[ReplayStep] = []
@@ -96,17 +104,19 @@ def replay_and_report(drive: Excerpt, detector: BoxDetector, spec: ReportSpec, c
             if step.snapshot.index == pictured_index:
                 pictured_steps.append(step)
             if step.method in film.methods:
-                film.add(step.method, _draw_step(step, grid, _make_caption(step), spec.min_score, FILM_WIDTH))
+                film.add(step.method, _draw_step(step, grid, _make_caption(step), min_scores[step.method], FILM_WIDTH))
             progress.advance(task)
     comparison = summarize_comparison(
         [accumulator.compute_result() for accumulator in metrics.values()], protocol, spec.missing
     )
     print_comparison(console, comparison, spec.title)
     pose_chapters = _make_pose_chapters(pose_summaries)
+    reliability = {name: accumulator.compute_reliability() for name, accumulator in metrics.items()}
+    reliability_chapter = make_reliability_chapter(reliability, spec.out / "reliability.png")
     for chapter, summary in zip(pose_chapters, (p for p in pose_summaries.values() if p.senders)):
         for warning in summary.make_warnings():
             console.print(f"{chapter.title}: {warning}", highlight=False, soft_wrap=True)
-    pictures = _save_animation(film, spec.out) + _save_pictures(pictured_steps, comparison, grid, spec)
+    pictures = _save_animation(film, spec.out) + _save_pictures(pictured_steps, comparison, grid, spec.out, min_scores)
     config = {
         "spec": spec,
         "detector": detector.config if isinstance(detector, Detector) else type(detector).__qualname__,
@@ -124,7 +134,7 @@ def replay_and_report(drive: Excerpt, detector: BoxDetector, spec: ReportSpec, c
         facts=_make_facts(drive, detector, spec),
         commands=spec.commands,
         notes=(*((comparison.footer,) if comparison.footer else ()), *_make_notes(protocol)),
-        chapters=pose_chapters,
+        chapters=(*pose_chapters, reliability_chapter),
         provenance=origin,
     )
     save_report(report, spec.out / REPORT)
@@ -150,6 +160,11 @@ def make_protocol(detector: BoxDetector) -> DetectionProtocol:
     return get_protocol("global-sort").with_range(
         (grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max)
     )
+
+
+def find_min_score(detector: BoxDetector, method: str, chosen: float | None = None) -> float:
+    """Return the score from which boxes of a method are drawn: the chosen one, else that of the weights."""
+    return default_drawing_score(detector, get_strategy(method).score_form) if chosen is None else chosen
 
 
 def _select_animated(methods: Sequence[str]) -> tuple[str, ...]:
@@ -186,7 +201,11 @@ def _save_animation(film: _Film, out: Path) -> tuple[ReportImage, ...]:
 
 
 def _save_pictures(
-    steps: Sequence[ReplayStep], comparison: MethodComparison, grid: BevGrid, spec: ReportSpec
+    steps: Sequence[ReplayStep],
+    comparison: MethodComparison,
+    grid: BevGrid,
+    folder: Path,
+    min_scores: Mapping[str, float],
 ) -> tuple[ReportImage, ...]:
     """Return one bird's-eye picture a method, of the same instant."""
     rows = {row.method: row for row in comparison.rows}
@@ -194,8 +213,8 @@ def _save_pictures(
     for step in steps:
         ap = rows[step.method].ap50
         caption = f"{_make_caption(step)} · AP@0.5 of the drive {ap.value:.3f}" if ap else _make_caption(step)
-        path = spec.out / f"{step.method}.png"
-        save_png(_draw_step(step, grid, caption, spec.min_score, WIDTH), path)
+        path = folder / f"{step.method}.png"
+        save_png(_draw_step(step, grid, caption, min_scores[step.method], WIDTH), path)
         out.append(ReportImage(path, f"{TITLES.get(step.method, step.method)}; {caption}"))
     return tuple(out)
 

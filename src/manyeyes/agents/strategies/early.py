@@ -21,6 +21,8 @@ MIN_POINT_LIMIT, OWN_POINTS_FACTOR = 65_536, 4
 class EarlyFusion(FusionStrategy):
     """The points of every agent's last two sweeps, quantised by the wire to a centimetre."""
 
+    score_form = "early"
+
     def compose_message(
         self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()
     ) -> Message | None:

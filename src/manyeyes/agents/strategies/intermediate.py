@@ -48,6 +48,7 @@ class IntermediateFusion(FusionStrategy):
     uses_history: bool = True
     needs_tokens: bool = True
     uses_points = False
+    score_form = "fused"
 
     def compose_message(
         self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()

@@ -33,6 +33,7 @@ class LateFusion(FusionStrategy):
     max_boxes: int = 128
     uses_history: bool = False
     uses_points = False
+    score_form = "late"
 
     def compose_message(
         self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()

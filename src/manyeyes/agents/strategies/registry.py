@@ -9,6 +9,7 @@ from typing import Protocol
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.datatypes import AgentFrame, Boxes, Message
 from manyeyes.datatypes.registry import Registry
+from manyeyes.models.score_calibration import ScoreForm
 
 
 class FusionStrategy(Protocol):
@@ -18,11 +19,13 @@ class FusionStrategy(Protocol):
         uses_history: older messages of each sender are fused too, also of senders without a current message.
         needs_tokens: it needs a TokenDetector.
         uses_points: it fuses the clouds of messages; packets of clouds are refused otherwise, since their decoding takes time.
+        score_form: form of its boxes, by which their scores are calibrated (``models.score_calibration``).
     """
 
     uses_history: bool = False
     needs_tokens: bool = False
     uses_points: bool = True
+    score_form: ScoreForm = "own"
 
     def compose_message(
         self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()

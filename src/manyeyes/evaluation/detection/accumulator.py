@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
 from torch import Tensor
 
 from manyeyes.agents.replay import ReplayStep
@@ -23,6 +24,7 @@ from manyeyes.evaluation.detection.average_precision import (
 )
 from manyeyes.evaluation.detection.communication import Communication, MessageRecord, summarize_messages
 from manyeyes.evaluation.statistics.bootstrap import Interval, bootstrap
+from manyeyes.evaluation.statistics.reliability import Reliability, compute_reliability
 
 IOU_THRESHOLDS = (0.5, 0.7)
 
@@ -95,6 +97,13 @@ class MetricAccumulator:
     def match_frames(self) -> tuple[tuple[FrameMatch, ...], ...]:
         """Return the frames matched at each of IOUS, in the order they came in."""
         return tuple(tuple(match_frame(frame, iou, self.protocol) for frame in self.frames) for iou in IOU_THRESHOLDS)
+
+    def compute_reliability(self) -> Reliability:
+        """Return the reliability of the scores of evaluated boxes, correct at the first of IOUS."""
+        matches = [match_frame(frame, IOU_THRESHOLDS[0], self.protocol) for frame in self.frames]
+        score = np.concatenate([match.score.numpy() for match in matches] or [np.zeros(0)])
+        is_correct = np.concatenate([match.tp.numpy() for match in matches] or [np.zeros(0, dtype=bool)])
+        return compute_reliability(score, is_correct)
 
     def summarize_communication(self) -> Communication:
         """Summarise what was sent, in bytes a message."""

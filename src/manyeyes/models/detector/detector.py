@@ -22,6 +22,7 @@ from manyeyes.models.detector.transformer import AttentionConfig, WindowTransfor
 from manyeyes.models.fusion.registry import get_fusion
 from manyeyes.models.fusion.token_merge import FusedBev
 from manyeyes.models.fusion.transform_tokens import Tokens
+from manyeyes.models.score_calibration import ScoreCalibration
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,7 @@ class Detector(nn.Module):
         self.grid, self.detection_range = config.grid, config.output_range or config.grid
         self.fingerprint = bytes(8)
         self.token_peaks: tuple[float, ...] | None = None
+        self.score_calibration: ScoreCalibration | None = None
         self.pillars = PillarEncoder(config.grid, config.pillar_channels, config.pillars, config.sweeps)
         self.encoder = SparseEncoder(config.pillar_channels, config.encoder)
         channels = self.encoder.out_channels

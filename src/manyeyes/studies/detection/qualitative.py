@@ -12,10 +12,12 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from manyeyes.agents.replay import ReplayStep, replay
-from manyeyes.datatypes import BevGrid
+from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.evaluation.detection.accumulator import MetricAccumulator
 from manyeyes.evaluation.detection.average_precision import DetectionProtocol
 from manyeyes.evaluation.detection.benchmark import load_detector, resolve_protocol
+from manyeyes.models.detector.protocols import BoxDetector
+from manyeyes.models.score_calibration import default_drawing_score
 from manyeyes.studies.detection.perturbations import COMBINED
 from manyeyes.studies.engine.replay_study import prepare_study
 from manyeyes.studies.engine.report import StudyContext
@@ -28,12 +30,12 @@ from manyeyes.viz.study_table import StudyTable, format_number
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-WIDTH, COLUMNS, MIN_SCORE = 960, 2, 0.4
+WIDTH, COLUMNS = 960, 2
 
 
 @dataclass(frozen=True)
 class QualitativeRow:
-    """A method in the frame: true boxes, those found at IoU 0.5 and 0.7, and what was neither, with scores from SCORE_MIN."""
+    """A method in the frame: true boxes, those found at IoU 0.5 and 0.7, and what was neither, of drawn scores."""
 
     method: str
     num_true: int
@@ -64,19 +66,23 @@ def run(options: EvaluationOptions, context: StudyContext) -> None:
         )
         if step.snapshot.index == frame_index
     ]
-    result_rows = [_make_row(step, protocol) for step in steps]
-    images = [_draw_image(step, row, detector.detection_range) for step, row in zip(steps, result_rows)]
+    result_rows = [_make_row(step, protocol, _find_min_score(detector, step.method)) for step in steps]
+    images = [_draw_image(step, row, detector) for step, row in zip(steps, result_rows)]
     results_table = _make_results_table(f"{scenario}, frame {frame_index}, {COMBINED.name}", result_rows)
     payload: dict[str, object] = {"scenario": scenario, "frame": frame_index, "rows": result_rows}
     save_picture = partial(save_png, _tile_images(images))
     study.context.write_report(study.title, payload, [results_table], save_picture, config={"conditions": [config]})
 
 
-def _make_row(step: ReplayStep, protocol: DetectionProtocol) -> QualitativeRow:
+def _find_min_score(detector: BoxDetector, method: str) -> float:
+    return default_drawing_score(detector, get_strategy(method).score_form)
+
+
+def _make_row(step: ReplayStep, protocol: DetectionProtocol, min_score: float) -> QualitativeRow:
     accumulator = MetricAccumulator(step.method, protocol)
     accumulator.add(step)
     half, seven = (matches[0] for matches in accumulator.match_frames())
-    confident = half.score >= MIN_SCORE
+    confident = half.score >= min_score
     num_found = (int((half.tp & confident).sum()), int((seven.tp & confident).sum()))
     sent = accumulator.summarize_communication()
     size = sent.bytes_per_message if sent.num_messages else 0.0
@@ -89,7 +95,7 @@ def _make_row(step: ReplayStep, protocol: DetectionProtocol) -> QualitativeRow:
     )
 
 
-def _draw_image(step: ReplayStep, row: QualitativeRow, grid: BevGrid) -> Image:
+def _draw_image(step: ReplayStep, row: QualitativeRow, detector: BoxDetector) -> Image:
     received_ids = {reception.message.agent_id for reception in step.perception.received}
     missing_ids = {frame.agent_id for frame in step.snapshot.frames} - received_ids
     view = make_scene(step.snapshot, step.boxes, step.ego, missing_ids)
@@ -97,7 +103,8 @@ def _draw_image(step: ReplayStep, row: QualitativeRow, grid: BevGrid) -> Image:
     caption = (
         f"{COMBINED.name} · {row.num_found[0]} of {row.num_true} found at IoU 0.5, {row.num_found[1]} at 0.7{sent}"
     )
-    return draw_scene(view, grid, step.method, caption, WIDTH, MIN_SCORE)
+    min_score = _find_min_score(detector, step.method)
+    return draw_scene(view, detector.detection_range, step.method, caption, WIDTH, min_score)
 
 
 def _tile_images(images: Sequence[Image]) -> Image:

@@ -16,14 +16,17 @@ from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.codebook import CodebookConfig
 from manyeyes.models.detector.detector import Detector, DetectorConfig
+from manyeyes.models.detector.fold_norms import fold_norms
+from manyeyes.models.score_calibration import CARD_KEY as SCORE_KEY
 from manyeyes.models.token_peaks import CARD_KEY
 from manyeyes.training.detector.codebook import fit_codebook
+from manyeyes.training.detector.score_calibration import calibrate_detector
 from manyeyes.training.detector.task import DetectorTask, DetectorTrainConfig
 from manyeyes.training.trainer import Progress, Trainer
 
 WEIGHTS = "weights.safetensors"
-CODEBOOK = "codebook"
-"""Folder of the weights with a codebook, in that of the run."""
+CODEBOOK, CALIBRATION = "codebook", "calibration"
+"""Folders of the weights with a codebook, and of those with calibrated scores too, in that of the run."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,7 @@ class TrainPlan:
         start: shipped weights that the first stage begins from where none are given; None for random ones.
         codebook: settings of the codebook that is fitted after the last stage; None for no codebook.
         codebook_frames: maximum number of evaluated frames that the codebook is fitted to, spread evenly.
+        calibration_frames: maximum number of evaluated frames of validation that scores are calibrated on, spread evenly.
     """
 
     stages: tuple[tuple[str, DetectorTrainConfig], ...]
@@ -44,12 +48,13 @@ class TrainPlan:
     start: str | None = None
     codebook: CodebookConfig | None = CodebookConfig()
     codebook_frames: int = 400
+    calibration_frames: int = 300
 
     def __post_init__(self) -> None:
         names = [name for name, _ in self.stages]
-        if not names or len(set(names)) < len(names) or CODEBOOK in names:
+        if not names or len(set(names)) < len(names) or {CODEBOOK, CALIBRATION} & set(names):
             raise ConfigError(
-                f"TrainPlan.stages needs names of its own for each stage, none '{CODEBOOK}'; got {names}."
+                f"TrainPlan.stages needs names of its own for each stage, none '{CODEBOOK}' or '{CALIBRATION}'; got {names}."
             )
 
     @property
@@ -73,9 +78,9 @@ def _report_nothing(stage: str, progress: Progress) -> None:
 class PlanRun:
     """A run of a plan in a folder; a killed one, made and run again, ends with the same weights bit by bit.
 
-    The folder holds one folder a stage, as of :class:`manyeyes.training.trainer.Trainer`, the folder ``codebook`` and
-    weights.safetensors. Of a finished stage only its weights are needed, so that the rest of its folder may be deleted, and the
-    folders of equal stages of another plan may be copied. Hold the lock of the folder, as for one stage.
+    The folder holds one folder a stage, as of :class:`manyeyes.training.trainer.Trainer`, the folders ``codebook`` and
+    ``calibration``, and weights.safetensors. Of a finished stage only its weights are needed, so that the rest of its folder may be
+    deleted, and the folders of equal stages of another plan may be copied. Hold the lock of the folder, as for one stage.
 
     Attributes:
         plan: what is trained.
@@ -83,6 +88,7 @@ class PlanRun:
         seed: of the first stage.
         folder: of the run.
         start: weights file that the first stage begins from.
+        validation: recording that scores are calibrated on; None leaves them as they are.
     """
 
     plan: TrainPlan
@@ -90,6 +96,7 @@ class PlanRun:
     seed: int
     folder: Path
     start: Path | None = None
+    validation: Recording | None = None
 
     def run(self, card: dict[str, Any] | None = None, report: Report = _report_nothing) -> Path:
         """Run what is left of the plan; returns the file of the final weights.
@@ -111,9 +118,8 @@ class PlanRun:
         if not dist.is_initialized() or dist.get_rank() == 0:
             summary = {"seed": self.seed, "steps": sum(stage["steps"] for stage in stages)}
             summary |= {"train_seconds": sum(stage["train_seconds"] for stage in stages), "stages": stages}
-            last = self._fit_codebook(weights, {**card, **summary})
-            model, made = checkpoint.load(last), checkpoint.read_card(last)
-            checkpoint.save(model, final, made, half=True)
+            last = self._calibrate(self._fit_codebook(weights, {**card, **summary}))
+            checkpoint.save(checkpoint.load(last), final, checkpoint.read_card(last), half=True)
         _wait_for_first()
         return final
 
@@ -156,6 +162,22 @@ class PlanRun:
         about = {"seed": seed, "tokens": tokens, "started_from": source}
         peaks = checkpoint.read_card(weights)[CARD_KEY]
         checkpoint.save(detector, path, {**card, CARD_KEY: peaks, "codebook": about}, half=True)
+        return path
+
+    def _calibrate(self, weights: Path) -> Path:
+        """Write the weights with calibrated scores, where there is a recording of validation; returns the file."""
+        if self.validation is None:
+            return weights
+        path, source = self.folder / CALIBRATION / WEIGHTS, checkpoint.load(weights).fingerprint
+        if path.exists() and checkpoint.load(path).fingerprint == source:
+            return path
+        validation = self.validation
+        frames = sum(1 for _ in iter_eval_frames(validation))
+        stride = max(1, frames // self.plan.calibration_frames)
+        detector = fold_norms(checkpoint.load(weights))
+        calibration, _ = calibrate_detector(lambda: validation, detector, stride)
+        card = checkpoint.read_card(weights) | {SCORE_KEY: calibration.to_card()}
+        checkpoint.save(checkpoint.load(weights), path, card, half=True)
         return path
 
 
