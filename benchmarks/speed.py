@@ -35,7 +35,8 @@ from dense_pointpillars import DenseConfig, DensePointPillars
 from street import street
 from torch import Tensor
 
-from manyeyes.agents.agent import EGO_HALF_SIZE_M, Agent
+from manyeyes.agents.agent import Agent
+from manyeyes.agents.own_detections import remove_own_body
 from manyeyes.agents.perception_cache import PerceptionCache, TokenOutput
 from manyeyes.agents.strategies.intermediate import gather_ego_tokens
 from manyeyes.agents.strategies.message_header import make_header
@@ -433,8 +434,7 @@ def _check(stages: Staged, sparse: Sparse) -> None:
         set_kept(sparse.model, sparse.kept[i] if sparse.kept else None)
         packets.append(agent.share(frame))
     found = agents[0].perceive(sparse.frames[0], (p for message in packets[1:] for p in message)).boxes
-    own = (stages.boxes.center[:, :2].abs() <= torch.tensor(EGO_HALF_SIZE_M)).all(1)
-    if not torch.equal(stages.boxes[~own].center, found.center):
+    if not torch.equal(remove_own_body(stages.boxes, sparse.frames[0]).center, found.center):
         raise RuntimeError(
             "The stages of the benchmark are no longer those of share and perceive; bring them up to date."
         )

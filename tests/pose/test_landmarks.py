@@ -5,8 +5,14 @@ import numpy as np
 import pytest
 import torch
 
-from manyeyes.datatypes import Boxes, ConfigError, ShapeError
-from manyeyes.pose.landmarks import EGO_BODY_SIZE_M, EGO_BODY_UNCERTAINTY, DetectorUncertainty, Landmarks
+from manyeyes.datatypes import AgentBody, Boxes, ConfigError, ShapeError
+from manyeyes.pose.landmarks import (
+    KNOWN_BODY_UNCERTAINTY,
+    UNKNOWN_BODY_SIZE_M,
+    UNKNOWN_BODY_UNCERTAINTY,
+    DetectorUncertainty,
+    Landmarks,
+)
 
 
 def marks(n=5, seed=0):
@@ -75,15 +81,25 @@ def test_descriptors_follow_their_landmarks():
         replace(one, descriptor=descriptor[:2])
 
 
-def test_the_body_of_the_ego_is_the_last_landmark_at_the_origin():
-    """It has the size of a car, and an error of its own; the others stay as they are."""
+BODY = AgentBody.standing(1.4, -0.1, (4.9, 2.1, 1.8), 0.02)
+
+
+@pytest.mark.parametrize("body", [BODY, None])
+def test_the_body_of_the_agent_is_the_last_landmark(body):
+    """It has its place, its size and an error of its own; the others stay as they are. Unknown, it is a car near the origin."""
     before = marks(5)
-    after = before.with_ego_body()
+    after = before.with_body(body)
     assert len(after) == 6
     for field in ("xy", "yaw", "size", "score", "sigma_xy", "sigma_yaw", "p_flip", "instant"):
         np.testing.assert_array_equal(getattr(after, field)[:5], getattr(before, field))
-    assert after.xy[5].tolist() == [0.0, 0.0] and after.yaw[5] == 0.0 and after.score[5] == 1.0
-    assert tuple(after.size[5]) == EGO_BODY_SIZE_M
-    error = (after.sigma_xy[5], after.sigma_yaw[5], after.p_flip[5])
-    assert error == (EGO_BODY_UNCERTAINTY.sigma_xy_m, EGO_BODY_UNCERTAINTY.sigma_yaw_rad, EGO_BODY_UNCERTAINTY.p_flip)
-    assert len(Landmarks.empty().with_ego_body()) == 1
+    assert after.score[5] == 1.0
+    place = (*after.xy[5], after.yaw[5], *after.size[5])
+    assert place == ((0.0, 0.0, 0.0, *UNKNOWN_BODY_SIZE_M) if body is None else (1.4, -0.1, 0.02, 4.9, 2.1))
+    error = UNKNOWN_BODY_UNCERTAINTY if body is None else KNOWN_BODY_UNCERTAINTY
+    assert (after.sigma_xy[5], after.sigma_yaw[5], after.p_flip[5]) == (
+        error.sigma_xy_m,
+        error.sigma_yaw_rad,
+        error.p_flip,
+    )
+    assert len(Landmarks.empty().with_body(body)) == 1
+    assert UNKNOWN_BODY_UNCERTAINTY.sigma_xy_m > 5 * KNOWN_BODY_UNCERTAINTY.sigma_xy_m

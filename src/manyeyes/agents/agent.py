@@ -13,7 +13,7 @@ import torch
 from manyeyes.agents.fusion_selection import KnownSenders, first_fusion_ns, select_for_fusion, update_known_senders
 from manyeyes.agents.isolation import Quarantine, content_error, isolate_failing
 from manyeyes.agents.message_history import MessageHistory
-from manyeyes.agents.own_detections import restore_own_boxes
+from manyeyes.agents.own_detections import remove_own_body, restore_own_boxes
 from manyeyes.agents.perception_cache import History, PerceptionCache
 from manyeyes.agents.pose_correction import CorrectionOutcome, PoseCorrection, SenderState
 from manyeyes.agents.pose_plausibility import (
@@ -34,6 +34,7 @@ from manyeyes.agents.token_codec import (
     require_codebook,
 )
 from manyeyes.comms import wire
+from manyeyes.comms.agent_body import count_agent_body_bytes
 from manyeyes.comms.inbox import Inbox, ReceivedMessage, Rejection
 from manyeyes.comms.receiver_limits import ReceiverLimits
 from manyeyes.comms.token_selection import select_within_budget
@@ -44,8 +45,6 @@ from manyeyes.models.score_calibration import calibrate_boxes
 
 if TYPE_CHECKING:
     from manyeyes.agents.map_perception import MapPredictor
-
-EGO_HALF_SIZE_M = (2.6, 1.3)
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,7 @@ class Agent:
         bodies = wire.encode_other_sections(message)
         if message.tokens is None:
             return wire.make_packets(message, bodies)
-        left = None if budget is None else budget - wire.count_bytes(bodies)
+        left = None if budget is None else budget - wire.count_bytes(bodies, message.body)
         kept, encoded = self._select(message, message.tokens, left)
         bodies += wire.encode_tokens(encoded, token_encoding=self.token_encoding, tables=self.token_format.tables)
         packets = wire.make_packets(message, bodies)
@@ -164,7 +163,8 @@ class Agent:
         is_coded, tables = self.token_encoding == "codebook", self.token_format.tables
         encoded = quantise_tokens(tokens, self.perception_cache.detector) if is_coded else tokens
         score = torch.ones(len(tokens.sites)) if message.token_score is None else message.token_score
-        encoded, score = select_within_budget(encoded, score, budget_bytes, self.token_encoding, tables=tables)
+        mtu = wire.DEFAULT_MTU - count_agent_body_bytes(message.body)
+        encoded, score = select_within_budget(encoded, score, budget_bytes, self.token_encoding, mtu, tables)
         kept = tokens.keep(torch.isin(tokens.sites.key, encoded.sites.key))
         return replace(message, tokens=kept, token_score=score), replace(message, tokens=encoded, token_score=score)
 
@@ -275,7 +275,7 @@ class Agent:
                 messages = self.message_history.update_and_get(messages, frame.timestamp_ns, untrusted.union(excluded))
             boxes = self.strategy.fuse(self.perception_cache, frame, messages)
             boxes = restore_own_boxes(boxes, self.perception_cache.process(frame).boxes)
-            return _Attempt(Perception(_remove_own_body(boxes, frame), usable, corrections), self._state)
+            return _Attempt(Perception(remove_own_body(boxes, frame), usable, corrections), self._state)
         finally:
             self._restore(before)
 
@@ -304,10 +304,3 @@ class Agent:
             if r.message.agent_id in message_of_agent
         )
         return tuple(kept), corrected.corrections
-
-
-def _remove_own_body(boxes: Boxes, frame: AgentFrame) -> Boxes:
-    """Remove the box of the agent itself, which other agents detect."""
-    if frame.is_infrastructure:
-        return boxes
-    return boxes[(boxes.center[:, 0].abs() > EGO_HALF_SIZE_M[0]) | (boxes.center[:, 1].abs() > EGO_HALF_SIZE_M[1])]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames in which z = 0 is the road as far as it is seen, for tilted sensors and for poses that ignore the slope.
+"""Frames as perception takes them: z = 0 is the road as far as it is seen, and no return is from the agent's own vehicle.
 
 An agent levels its frame once, at the start of ``share`` and of ``perceive``. Points, pose, odometry, cameras and the agent's body
 move together, so everything that is measured in the levelled frame, and every message, agrees with the pose that is sent with it.
@@ -13,9 +13,16 @@ from dataclasses import dataclass, replace
 
 from manyeyes.datatypes import AgentFrame, Snapshot, Transform
 from manyeyes.ops.lidar.ground_plane import DEFAULT_GROUND_CONFIG, GroundPlaneConfig, GroundStatus, fit_ground_plane
+from manyeyes.ops.lidar.own_returns import remove_own_returns
 
 MAX_CACHED_FRAMES = 8
 """Number of frames of one agent whose levelled frames are kept."""
+
+
+def clean_frame(frame: AgentFrame) -> AgentFrame:
+    """Return the frame without returns from the agent's own vehicle; the same object if there are none."""
+    points = remove_own_returns(frame.points, frame.body)
+    return frame if points is frame.points else replace(frame, points=points)
 
 
 def find_levelling(frame: AgentFrame, config: GroundPlaneConfig = DEFAULT_GROUND_CONFIG) -> Transform | None:
@@ -26,7 +33,10 @@ def find_levelling(frame: AgentFrame, config: GroundPlaneConfig = DEFAULT_GROUND
 
 @dataclass(frozen=True)
 class LevelledFrame:
-    """A frame and its levelled frame, the same object where levelled_from_agent is None."""
+    """A frame, and its levelled frame without own returns; the same object if nothing changes.
+
+    levelled_from_agent: None if the frame is not moved.
+    """
 
     own: AgentFrame
     levelled: AgentFrame
@@ -34,15 +44,16 @@ class LevelledFrame:
 
     @classmethod
     def of(cls, frame: AgentFrame, config: GroundPlaneConfig = DEFAULT_GROUND_CONFIG) -> LevelledFrame:
-        """Level a frame."""
-        motion = find_levelling(frame, config)
-        return cls(frame, frame if motion is None else frame.moved(motion), motion)
+        """Remove the own returns of a frame, and level it."""
+        cleaned = clean_frame(frame)
+        motion = find_levelling(cleaned, config)
+        return cls(frame, cleaned if motion is None else cleaned.moved(motion), motion)
 
 
 class FrameLeveller:
     """Levels the frames of one agent, each once: frames are compared by identity, and a levelled frame is not levelled again.
 
-    config: of the fit; None levels no frame.
+    config: of the fit; None changes no frame.
     """
 
     def __init__(self, config: GroundPlaneConfig | None = DEFAULT_GROUND_CONFIG) -> None:
@@ -71,7 +82,10 @@ class SnapshotLeveller:
         self._motions: dict[tuple[str, int, int], Transform | None] = {}
 
     def __call__(self, snapshot: Snapshot) -> Snapshot:
-        """Return the snapshot with levelled frames and true poses; the same object if no frame is tilted."""
+        """Return the snapshot with cleaned and levelled frames and true poses; the same object if nothing changes."""
+        frames = tuple(map(clean_frame, snapshot.frames))
+        if any(cleaned is not frame for cleaned, frame in zip(frames, snapshot.frames)):
+            snapshot = replace(snapshot, frames=frames)
         motions = [self.find(snapshot, frame) for frame in snapshot.frames]
         return snapshot if all(m is None for m in motions) else move_frames(snapshot, motions)
 
@@ -79,7 +93,7 @@ class SnapshotLeveller:
         """Return the motion from a frame of the snapshot to its levelled frame; None if the frame stays as it is."""
         key = snapshot.scenario, snapshot.index, frame.agent_id
         if key not in self._motions:
-            self._motions[key] = find_levelling(frame, self.config)
+            self._motions[key] = find_levelling(clean_frame(frame), self.config)
         return self._motions[key]
 
 

@@ -2,10 +2,11 @@
 """Pose correction of received messages before fusion, from objects that ego and sender both detect.
 
 No bytes are added: the landmarks of a sender are the boxes it sends, those proposed by its tokens, or detections in its cloud, and
-its own vehicle, which other agents detect. Boxes of an earlier timestamp are propagated by their velocity. A sender without a match
-is propagated from its last corrected pose: its current landmarks are matched with its earlier ones. Pairs of senders are matched
-too; a pose graph combines all matches and isolates inconsistent senders. A monitor reports senders whose prior poses have an offset
-or drift. With a FeaKM corrector, senders add descriptors of 32 bytes an object, and boxes of 13 bytes where they send none.
+its own vehicle, which other agents detect (``AgentFrame.body``). Boxes of an earlier timestamp are propagated by their velocity. A
+sender without a match is propagated from its last corrected pose: its current landmarks are matched with its earlier ones. Pairs of
+senders are matched too; a pose graph combines all matches and isolates inconsistent senders. A monitor reports senders whose prior
+poses have an offset or drift. With a FeaKM corrector, senders add descriptors of 32 bytes an object, and boxes of 13 bytes where
+they send none.
 """
 
 from __future__ import annotations
@@ -217,7 +218,7 @@ class PoseCorrection:
         """Return landmarks of an agent's own frame for the corrector."""
         if self.net is None:
             landmarks = self._select_landmarks(cache.process(frame).boxes, None, 0.0)
-            return landmarks if frame.is_infrastructure else landmarks.with_ego_body()
+            return landmarks if frame.is_infrastructure else landmarks.with_body(frame.body)
         points = extract_own_keypoints(self.net, cache, frame)
         return self._select_landmarks(points.boxes, points.descriptor, 0.0)
 
@@ -226,7 +227,7 @@ class PoseCorrection:
         if self.net is None:
             landmarks = self._select_landmarks(extract_message_boxes(cache, message), None, seconds)
             # An older message does not give the sender's own position now: its velocity is not sent.
-            return landmarks if message.is_infrastructure or seconds else landmarks.with_ego_body()
+            return landmarks if message.is_infrastructure or seconds else landmarks.with_body(message.body)
         points = extract_message_keypoints(message)
         return Landmarks.empty() if points is None else self._select_landmarks(points.boxes, points.descriptor, seconds)
 

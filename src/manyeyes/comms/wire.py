@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Wire format, version 2: a message as packets that each decode alone, the most important first.
+"""Wire format, versions 2 and 3: a message as packets that each decode alone, the most important first.
 
 This text is the specification. All numbers are little-endian. A packet is a header, one body and a checksum:
 
@@ -7,10 +7,10 @@ This text is the specification. All numbers are little-endian. A packet is a hea
 offset bytes type     meaning
 ====== ===== ======== =====================================================================================
 0      2     bytes    ``ME``
-2      1     u8       version, 2
+2      1     u8       version, 2 without the agent's body, 3 with it
 3      1     u8       flags: bits 0-2 kind of body (0 none, 1 tokens, 2 objects, 3 points, 4 request, 5 map
                       elements), bit 3 sender is infrastructure, bits 4-5 which part of the quaternion (w, x, y, z)
-                      is left out, 6-7 zero
+                      is left out, bit 6 the agent's body follows the header, bit 7 zero
 4      2     u16      number of this packet within its message, from 0
 6      2     u16      packets in the message, all kinds together
 8      4     i32      agent id
@@ -23,8 +23,18 @@ offset bytes type     meaning
 53     3     3 x i8   lower factor L of their correlations (yx, wx wy), 1/127; the diagonal follows, since rows have
                       length 1 (a longer row is shortened): the covariance is never indefinite
 56     8     bytes    model fingerprint
-64     ...            body
+64     9              version 3, packet 0 only: the agent's body
+...    ...            body
 end-4  4     u32      CRC-32 (zlib) of everything before it
+====== ===== ======== =====================================================================================
+
+The agent's body is the box of its vehicle in its own frame, which stands on the ground plane; without it, the body is unknown. A
+message of version 3 has it in its packet 0, and no packet of version 2 has it:
+
+====== ===== ======== =====================================================================================
+0      4     2 x i16  centre x, y, centimetres, within 20 m
+4      2     i16      yaw, 0.01 degree, -18000 to 17999
+6      3     3 x u8   length, width, height, 0.1 m, 1 to 250
 ====== ===== ======== =====================================================================================
 
 Tokens (kind 1), some cells of one grid with their features:
@@ -100,14 +110,16 @@ import torch
 from numpy.typing import NDArray
 
 from manyeyes.comms import payloads, primitives
+from manyeyes.comms.agent_body import AGENT_BODY_BYTES, count_agent_body_bytes, pack_agent_body, read_agent_body
 from manyeyes.comms.entropy import CodeTables
 from manyeyes.comms.map_payload import ElementRows, merge_elements, pack_element_bodies
 from manyeyes.comms.payloads import Body, ObjectRows, PointRows, TokenCodec, TokenEncoding, TokenRows
 from manyeyes.comms.primitives import PacketError, log_codes, log_values
-from manyeyes.datatypes import BevGrid, ConfigError, Message, Transform, WireError
+from manyeyes.datatypes import AgentBody, BevGrid, ConfigError, Message, Transform, WireError
 from manyeyes.datatypes.message import RequestMap
 
-VERSION = 2
+VERSION = 3
+VERSION_WITHOUT_BODY = 2
 DEFAULT_MTU = 1398
 
 _MAGIC = b"ME"
@@ -124,6 +136,7 @@ _SIGMA_M, _SIGMA_RAD = (1e-3, 1e4), (1e-5, 10.0)
 _CODES = np.arange(256, dtype=np.uint8)
 _SIGMAS_M: list[float] = log_values(_CODES, *_SIGMA_M).tolist()
 _SIGMAS_RAD: list[float] = log_values(_CODES, *_SIGMA_RAD).tolist()
+_HAS_BODY = 1 << 6
 _EMPTY_BITMAP = np.zeros(0, np.uint8)
 _SENDING_ORDER = (payloads.OBJECTS, payloads.REQUEST, payloads.TOKENS, payloads.ELEMENTS, payloads.POINTS)
 
@@ -152,12 +165,13 @@ class EncodedBody(NamedTuple):
 
 
 class Fragment(NamedTuple):
-    """One packet, read and checked. body is None where the message has no section."""
+    """One packet, read and checked. body is None where the message has no section. agent_body: of the sender, in packet 0."""
 
     header: MessageHeader
     number: int
     body: Body
     packet: bytes
+    agent_body: AgentBody | None = None
 
 
 def encode(
@@ -177,7 +191,7 @@ def encode(
 
 def encode_other_sections(message: Message, mtu: int = DEFAULT_MTU) -> list[EncodedBody]:
     """Return the sections of a message apart from its tokens, as the bodies of packets."""
-    capacity, bodies = _body_capacity(mtu), dict[int, list[bytes]]()
+    capacity, bodies = _body_capacity(mtu, message), dict[int, list[bytes]]()
     if message.objects is not None:
         bodies[payloads.OBJECTS] = payloads.pack_object_bodies(message.objects, message.descriptors, capacity)
     if message.request is not None:
@@ -197,7 +211,7 @@ def encode_tokens(
     tables: CodeTables | None = None,
 ) -> list[EncodedBody]:
     """Return the tokens of a message as the bodies of packets, none without tokens; arguments and errors as in :func:`encode`."""
-    token_codec, capacity = TokenCodec(token_encoding, tables), _body_capacity(mtu)
+    token_codec, capacity = TokenCodec(token_encoding, tables), _body_capacity(mtu, message)
     if message.tokens is None:
         return []
     if tables is not None and tables.fingerprint != message.fingerprint:
@@ -208,15 +222,17 @@ def encode_tokens(
     return [EncodedBody(payloads.TOKENS, content) for content in rows]
 
 
-def _body_capacity(mtu: int) -> int:
-    if not HEADER_BYTES + payloads.TOKENS_BYTES < mtu <= 65535:
-        raise ConfigError(f"mtu is from {HEADER_BYTES + payloads.TOKENS_BYTES + 1} to 65535 bytes; got {mtu}.")
-    return mtu - HEADER_BYTES
+def _body_capacity(mtu: int, message: Message) -> int:
+    # Which packet is the first is not known before all sections are packed: each leaves room for the agent's body.
+    header_bytes = HEADER_BYTES + count_agent_body_bytes(message.body)
+    if not header_bytes + payloads.TOKENS_BYTES < mtu <= 65535:
+        raise ConfigError(f"mtu is from {header_bytes + payloads.TOKENS_BYTES + 1} to 65535 bytes; got {mtu}.")
+    return mtu - header_bytes
 
 
-def count_bytes(bodies: Iterable[EncodedBody]) -> int:
-    """Return bytes of the packets of these bodies."""
-    return sum(HEADER_BYTES + len(body.content) for body in bodies)
+def count_bytes(bodies: Iterable[EncodedBody], agent_body: AgentBody | None = None) -> int:
+    """Return bytes of the packets of these bodies, and of the body of their agent."""
+    return sum(HEADER_BYTES + len(body.content) for body in bodies) + count_agent_body_bytes(agent_body)
 
 
 def make_packets(message: Message, bodies: Sequence[EncodedBody]) -> list[bytes]:
@@ -228,9 +244,13 @@ def make_packets(message: Message, bodies: Sequence[EncodedBody]) -> list[bytes]
         )
     common = _common_fields(message)
     rest, count, packets = _COMMON.pack(*common.rest), len(bodies), []
+    version, agent_body = VERSION_WITHOUT_BODY, b""
+    if message.body is not None:
+        version, agent_body = VERSION, pack_agent_body(message.body)
     for number, (kind, content) in enumerate(bodies):
-        start = _START.pack(_MAGIC, VERSION, common.flags | kind, number, count)
-        packet = b"".join((start, rest, content))
+        flags, extension = (common.flags, b"") if number else (common.flags | bool(agent_body) * _HAS_BODY, agent_body)
+        start = _START.pack(_MAGIC, version, flags | kind, number, count)
+        packet = b"".join((start, rest, extension, content))
         packets.append(packet + _CRC.pack(zlib.crc32(packet)))
     return packets
 
@@ -338,17 +358,21 @@ def _decode_covariance(covariance_codes: tuple[int, ...]) -> NDArray[np.float64]
 
 
 class Envelope(NamedTuple):
-    """Header of one packet whose checksum matches; its body is not read. number: of the packet; kind: of the body."""
+    """Header of one packet whose checksum matches; its body is not read. number: of the packet; kind: of the body, which begins
+    at body_at.
+    """
 
     header: MessageHeader
     number: int
     kind: int
     packet: bytes
+    agent_body: AgentBody | None
+    body_at: int
 
     @property
     def claimed_cells(self) -> int:
         """Number of cells that a body of tokens claims to hold; 0 of other kinds."""
-        return payloads.claimed_cells(self.packet, _BODY_AT) if self.kind == payloads.TOKENS else 0
+        return payloads.claimed_cells(self.packet, self.body_at) if self.kind == payloads.TOKENS else 0
 
 
 def open_packet(packet: bytes) -> Envelope:
@@ -356,9 +380,10 @@ def open_packet(packet: bytes) -> Envelope:
     packet = packet if type(packet) is bytes else bytes(memoryview(packet))
     if len(packet) < 3 or packet[:2] != _MAGIC:
         raise PacketError("garbage", f"Not a manyeyes packet: expected the bytes {_MAGIC!r}, got {packet[:2]!r}.")
-    if packet[2] != VERSION:
+    if packet[2] not in (VERSION_WITHOUT_BODY, VERSION):
+        known = f"{VERSION_WITHOUT_BODY} or {VERSION}"
         raise PacketError(
-            "version", f"Wire version {packet[2]} is not known here; expected {VERSION}: update the older side."
+            "version", f"Wire version {packet[2]} is not known here; expected {known}: update the older side."
         )
     if len(packet) < HEADER_BYTES:
         raise PacketError("garbage", f"Truncated packet: {len(packet)} bytes, a header alone has {HEADER_BYTES}.")
@@ -367,9 +392,16 @@ def open_packet(packet: bytes) -> Envelope:
     if _CRC.unpack_from(packet, len(packet) - _CRC.size)[0] != zlib.crc32(memoryview(packet)[: -_CRC.size]):
         agent_id = _COMMON.unpack(common)[0]
         raise PacketError("checksum", f"The checksum of a packet with agent id {agent_id} does not match its bytes.")
-    if flags >> 6 or number >= count:
+    has_body = packet[2] == VERSION and number == 0
+    if flags >> 7 or number >= count or bool(flags & _HAS_BODY) != has_body:
         raise PacketError("garbage", f"Contradictory header: flags {flags:#04x}, packet {number} of {count}.")
-    return Envelope(_header(common, flags >> 3, count), number, flags & 7, packet)
+    header = _header(common, flags >> 3 & 7, count)
+    if not has_body:
+        return Envelope(header, number, flags & 7, packet, None, _BODY_AT)
+    if len(packet) < HEADER_BYTES + AGENT_BODY_BYTES:
+        raise PacketError("garbage", f"Truncated packet: {len(packet)} bytes do not hold the body of its agent.")
+    agent_body = read_agent_body(packet[_BODY_AT : _BODY_AT + AGENT_BODY_BYTES])
+    return Envelope(header, number, flags & 7, packet, agent_body, _BODY_AT + AGENT_BODY_BYTES)
 
 
 def read_fragment(envelope: Envelope, tables: CodeTables | None = None) -> Fragment:
@@ -378,8 +410,8 @@ def read_fragment(envelope: Envelope, tables: CodeTables | None = None) -> Fragm
     tables: of the reader's weights, by which coded tokens are read.
     """
     header, packet = envelope.header, envelope.packet
-    body = payloads.read_body(envelope.kind, packet[_BODY_AT : -_CRC.size], header.fingerprint, tables)
-    return Fragment(header, envelope.number, body, packet)
+    body = payloads.read_body(envelope.kind, packet[envelope.body_at : -_CRC.size], header.fingerprint, tables)
+    return Fragment(header, envelope.number, body, packet, envelope.agent_body)
 
 
 def decode_packet(packet: bytes, tables: CodeTables | None = None) -> Fragment:
@@ -500,6 +532,7 @@ class Assembly:
             points=payloads.merge_points([b.rows for b in bodies if isinstance(b, PointRows)]),
             request=next((b for b in bodies if isinstance(b, RequestMap)), None),
             local_map=merge_elements([b for b in bodies if isinstance(b, ElementRows)]),
+            body=self.fragments[0].agent_body if 0 in self.fragments else None,
         )
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from manyeyes._lazy import attach
 
 if TYPE_CHECKING:
+    from manyeyes.datatypes.body import AgentBody as AgentBody
     from manyeyes.datatypes.boxes import (
         CLASSES as CLASSES,
         LABELS as LABELS,

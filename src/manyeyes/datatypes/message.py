@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from manyeyes.datatypes.body import AgentBody
 from manyeyes.datatypes.boxes import Boxes
 from manyeyes.datatypes.errors import ShapeError
 from manyeyes.datatypes.grid import BevGrid
@@ -64,7 +65,8 @@ class Message:
     fingerprint: 8 bytes that name the weights which made the tokens; tokens of other weights are refused.
     tokens: one grid, in the sender's frame; features float, or uint8 rows of the weights' codebook. token_score: (N,), which
     cells matter most. objects and points: sender's frame. descriptors: (objects, DESCRIPTOR) in [-1, 1], of each object, for
-    matching. request: the sender's confidence. local_map: the map elements that it observes.
+    matching. request: the sender's confidence. local_map: the map elements that it observes. body: of the sender's vehicle, in its
+    frame; None is unknown, and of infrastructure.
     """
 
     agent_id: int
@@ -80,3 +82,4 @@ class Message:
     descriptors: Tensor | None = None
     request: RequestMap | None = None
     local_map: LocalMap | None = None
+    body: AgentBody | None = None

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from manyeyes.datatypes.body import AgentBody
 from manyeyes.datatypes.boxes import VEHICLES, Boxes
 from manyeyes.datatypes.camera import CameraImage
 from manyeyes.datatypes.errors import ShapeError
@@ -25,7 +26,8 @@ class AgentFrame:
     world_from_agent: the *prior* pose; pose_covariance: (3, 3) of x, y (m) and yaw (rad) in the world, the
     agent's estimate of its error. sensor_height_m: height of the LiDAR above the road. speed_mps: own speed. odometry:
     the pose in a local frame that drifts but never jumps, for motion since earlier frames; by default the prior pose.
-    images: of its cameras, if it has any and they were requested.
+    images: of its cameras, if it has any and they were requested. body: of its vehicle, in its frame; None is unknown, and of
+    infrastructure.
     """
 
     agent_id: int
@@ -38,6 +40,7 @@ class AgentFrame:
     is_infrastructure: bool = False
     odometry: Transform | None = None
     images: tuple[CameraImage, ...] = ()
+    body: AgentBody | None = None
 
     def __post_init__(self) -> None:
         if self.pose_covariance.shape != (3, 3):
@@ -57,6 +60,7 @@ class AgentFrame:
         pose_covariance: Numbers | None = None,
         sensor_height_m: float = 1.9,
         speed_mps: float = 0.0,
+        body: AgentBody | None = None,
     ) -> AgentFrame:
         """Build a frame from a cloud or its points (N, 3), and a pose or its matrix (4, 4): tensors, numpy arrays or lists.
 
@@ -74,6 +78,7 @@ class AgentFrame:
             as_tensor(covariance, "AgentFrame.pose_covariance", torch.float64),
             sensor_height_m,
             speed_mps,
+            body=body,
         )
 
     def now_from_earlier(self, earlier: AgentFrame) -> Transform:
@@ -82,7 +87,7 @@ class AgentFrame:
         return now.inverse() @ then
 
     def moved(self, new_from_agent: Transform) -> AgentFrame:
-        """Return the same observation in a new frame of the agent: points, poses, cameras and the height of the LiDAR."""
+        """Return the same observation in a new frame of the agent: points, poses, cameras, body and the height of the LiDAR."""
         agent_from_new = new_from_agent.double().inverse()
         lidar = new_from_agent.apply(torch.tensor([[0.0, 0.0, self.sensor_height_m]], dtype=torch.float64))
         return replace(
@@ -92,6 +97,7 @@ class AgentFrame:
             sensor_height_m=float(lidar[0, 2]),
             odometry=None if self.odometry is None else self.odometry @ agent_from_new,
             images=tuple(image.moved(new_from_agent) for image in self.images),
+            body=None if self.body is None else self.body.moved(new_from_agent),
         )
 
 

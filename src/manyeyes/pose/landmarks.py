@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from manyeyes.datatypes import Boxes, ConfigError, ShapeError
+from manyeyes.datatypes import AgentBody, Boxes, ConfigError, ShapeError
 from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.datatypes.numbers import Numbers, as_tensor
 
@@ -39,9 +39,11 @@ class DetectorUncertainty:
             )
 
 
-EGO_BODY_UNCERTAINTY = DetectorUncertainty(0.3, 0.03, 0.01)
-"""Deviation of a vehicle's centre from the origin of its own frame, and of its heading from the frame's."""
-EGO_BODY_SIZE_M = (4.5, 1.9)
+KNOWN_BODY_UNCERTAINTY = DetectorUncertainty(0.1, 0.02, 0.01)
+"""Error of a vehicle's own box where its place in the vehicle's frame is known."""
+UNKNOWN_BODY_UNCERTAINTY = DetectorUncertainty(1.0, 0.03, 0.01)
+"""Distance of a vehicle's middle from the origin of its frame where it is unknown: formats put it up to 2 m behind or ahead."""
+UNKNOWN_BODY_SIZE_M = (4.5, 1.9)
 
 
 @dataclass(frozen=True)
@@ -131,17 +133,23 @@ class Landmarks:
         zero = np.zeros(0)
         return cls(np.zeros((0, 2)), zero, np.zeros((0, 2)), zero, zero, zero, zero, np.zeros(0, np.int64))
 
-    def with_ego_body(self) -> Landmarks:
-        """Append the ego vehicle itself at the origin: other agents observe it, its own sensor does not."""
-        one = np.ones(1)
+    def with_body(self, body: AgentBody | None) -> Landmarks:
+        """Append the vehicle that carries the sensor: other agents observe it, its own sensor does not.
+
+        body: in the frame of the landmarks; None: unknown, a car near the origin with a large uncertainty.
+        """
+        error = UNKNOWN_BODY_UNCERTAINTY if body is None else KNOWN_BODY_UNCERTAINTY
+        xy, yaw_rad, size = (0.0, 0.0), 0.0, UNKNOWN_BODY_SIZE_M
+        if body is not None:
+            xy, yaw_rad, size = body.center[:2], body.yaw_rad, body.size[:2]
         own = Landmarks(
-            np.zeros((1, 2)),
-            np.zeros(1),
-            np.array([EGO_BODY_SIZE_M]),
-            one,
-            EGO_BODY_UNCERTAINTY.sigma_xy_m * one,
-            EGO_BODY_UNCERTAINTY.sigma_yaw_rad * one,
-            EGO_BODY_UNCERTAINTY.p_flip * one,
+            np.array([xy]),
+            np.array([yaw_rad]),
+            np.array([size]),
+            np.ones(1),
+            np.array([error.sigma_xy_m]),
+            np.array([error.sigma_yaw_rad]),
+            np.array([error.p_flip]),
             np.zeros(1, np.int64),
         )
         return Landmarks.cat([self, own])

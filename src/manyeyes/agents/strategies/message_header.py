@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Header of every message: agent, timestamp and pose."""
+"""Header of every message: agent, timestamp, pose and body."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ def make_header(frame: AgentFrame, fingerprint: bytes) -> Message:
         pose_covariance=frame.pose_covariance,
         fingerprint=fingerprint,
         is_infrastructure=frame.is_infrastructure,
+        body=frame.body,
     )
 
 

@@ -134,7 +134,7 @@ def _detect_keypoints(cache: PerceptionCache, frame: AgentFrame, net: FeakmNet |
 
 def _make_landmarks(frame: AgentFrame, boxes: Boxes) -> Landmarks:
     landmarks = Landmarks.of_boxes(boxes)
-    return landmarks if frame.is_infrastructure else landmarks.with_ego_body()
+    return landmarks if frame.is_infrastructure else landmarks.with_body(frame.body)
 
 
 def _make_landmark_pairs(

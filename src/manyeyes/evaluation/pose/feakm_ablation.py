@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import torch
 
-from manyeyes.agents.agent import EGO_HALF_SIZE_M
+from manyeyes.agents.own_detections import remove_own_body
 from manyeyes.agents.perception_cache import PerceptionCache, TokenOutput
 from manyeyes.datasets.base import Recording
 from manyeyes.datasets.perturbation import PoseNoise
@@ -147,6 +147,4 @@ class _CachedViews:
                 parts.append(AgentTokens(0, features, xy, estimate.ego_from_other, 0.0, sigma_xy_m, sigma_yaw_rad))
         past_cells = to_ego_frame(self.past_tokens, own.grid, 1) if self.past_tokens else None
         _, raw = self.ego_cache.fuse(to_ego_frame([*parts, *self.past_tokens], own.grid, 1), past_cells)
-        boxes = self.ego_cache.decode(raw)
-        outside_ego = (boxes.center[:, 0].abs() > EGO_HALF_SIZE_M[0]) | (boxes.center[:, 1].abs() > EGO_HALF_SIZE_M[1])
-        return boxes if frames[0].is_infrastructure else boxes[outside_ego], is_found
+        return remove_own_body(self.ego_cache.decode(raw), frames[0]), is_found

@@ -125,7 +125,7 @@ class GroundPlaneConfig:
     max_height_sigma_m: float = 0.15
     sigma_range_m: float = 30.0
     near_range_m: float = 12.0
-    level_tilt_rad: float = math.radians(0.2)
+    level_tilt_rad: float = math.radians(0.1)
     level_offset_m: float = 0.05
     max_points: int = 40_000
 

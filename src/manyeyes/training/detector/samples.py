@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 import torch
 
-from manyeyes.agents.level_frame import SnapshotLeveller
+from manyeyes.agents.level_frame import SnapshotLeveller, clean_frame
 from manyeyes.datasets.base import Recording, iter_eval_frames
 from manyeyes.datasets.deferred import read_deferred
 from manyeyes.datasets.mixed import draw_scenario
@@ -277,7 +277,7 @@ class _AugmentedScene:
         row = self._row(back, agent_id)
         if row is None:
             return None
-        frame = self._moments[-1 - back].frames[row]
+        frame = clean_frame(self._moments[-1 - back].frames[row])
         points = frame.points if self._sensors is None else self._sensors.points(frame)
         cloud = points.transform(self._agent_from_view(back, row).inverse())
         if self._config.max_point_dropout:
