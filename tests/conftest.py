@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One torch thread for every test; profiles of hypothesis; real maps are read where they are."""
+"""One torch thread for every test; profiles of hypothesis; real maps are read where they are; a device beside the CPU."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 import torch
 from hypothesis import HealthCheck, settings
+from tests.emulated_device import DEVICE, emulate
 
 torch.set_num_threads(1)
 
@@ -20,3 +23,15 @@ _MAPS = Path(__file__).resolve().parents[2] / "shared" / "data"
 if _MAPS.is_dir():
     os.environ.setdefault("MANYEYES_MAPS", str(_MAPS))
     os.environ.setdefault("MANYEYES_TOWNS", str(_MAPS / "carla_opendrive"))
+
+
+@pytest.fixture(params=["emulated", "cuda"])
+def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
+    """A device beside the CPU: the emulated one everywhere, and a GPU where there is one."""
+    if request.param == "emulated":
+        with emulate():
+            yield DEVICE
+    elif torch.cuda.is_available():
+        yield torch.device("cuda", 0)
+    else:
+        pytest.skip("needs a GPU; torch finds none")

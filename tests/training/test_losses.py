@@ -68,14 +68,14 @@ def test_prune_focal_by_a_loop():
         p = 1 / (1 + math.exp(-s))
         pt, weight = (p, 0.25 * cell_weight[box]) if box >= 0 else (1 - p, 0.75)
         total -= weight * (1 - pt) ** 2 * math.log(pt)
-    got = prune_focal(PruneOutput(Sites(torch.arange(5), GRID), logit), torch.tensor(near))
+    got = prune_focal(PruneOutput(Sites(torch.arange(5), GRID), logit), torch.tensor(near), max(near) + 1)
     assert float(got) == pytest.approx(total / 3, rel=1e-5)
 
 
 def test_prune_focal_limits_the_weight_of_a_cell_to_eight():
     near = torch.tensor([0] + [1] * 99)
     logit = torch.zeros(100, requires_grad=True)
-    prune_focal(PruneOutput(Sites(torch.arange(100), GRID), logit), near).backward()
+    prune_focal(PruneOutput(Sites(torch.arange(100), GRID), logit), near, int(near.max()) + 1).backward()
     assert logit.grad is not None
     assert float(logit.grad[0] / logit.grad[1]) == pytest.approx(8 / (100 / (2 * 99)), rel=1e-5)
 
@@ -85,7 +85,7 @@ def test_without_a_box_every_term_is_finite_and_gradients_flow(scale):
     some = raw()
     some = dataclasses.replace(some, heatmap_logit=(some.heatmap_logit * scale).detach().requires_grad_())
     targets = assign_targets(SITES, [Boxes.empty()], TargetConfig())
-    prune = prune_focal(PruneOutput(SITES, some.heatmap_logit), torch.full((len(SITES),), -1))
+    prune = prune_focal(PruneOutput(SITES, some.heatmap_logit), torch.full((len(SITES),), -1), 0)
     terms = head_terms(some, targets, prune, torch.zeros(()), torch.zeros(()))
     total = terms.total(LossConfig())
     total.backward()

@@ -14,8 +14,9 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from manyeyes.datatypes import CheckpointError, ConfigError
+from manyeyes.training.optimiser import parameter_groups
 from manyeyes.training.presets import TRAINING_PRESETS
-from manyeyes.training.trainer import Task, TrainConfig, Trainer, parameter_groups, warmup_cosine
+from manyeyes.training.trainer import Task, TrainConfig, Trainer, warmup_cosine
 
 pytestmark = pytest.mark.training
 

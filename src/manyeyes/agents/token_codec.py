@@ -34,7 +34,7 @@ def make_token_format(detector: BoxDetector) -> TokenFormat:
     if not has_tokens(detector):
         return TokenFormat(detector.fingerprint, detector.grid, 0)
     codebook = detector.codebook
-    tables = None if codebook is None else CodeTables(detector.fingerprint, codebook.frequencies.numpy())
+    tables = None if codebook is None else CodeTables(detector.fingerprint, codebook.frequencies.cpu().numpy())
     peaks = getattr(detector, "token_peaks", None)
     return TokenFormat(detector.fingerprint, detector.token_grid, detector.token_channels, tables, peaks)
 

@@ -73,7 +73,7 @@ class Boxes:
         """
         center = as_tensor(center, "Boxes.center", None)
         n = center.shape[0] if center.ndim else 0
-        zeros, zero_ids = torch.zeros(n, dtype=center.dtype), torch.zeros(n, dtype=torch.int64)
+        zeros, zero_ids = center.new_zeros(n), center.new_zeros(n, dtype=torch.int64)
 
         def column(name: str, value: Numbers | None, default: Tensor) -> Tensor:
             if value is None or isinstance(value, Tensor):
@@ -90,7 +90,7 @@ class Boxes:
             zeros,
             zeros,
             zeros,
-            column("velocity", velocity, torch.zeros(n, 2, dtype=center.dtype)),
+            column("velocity", velocity, center.new_zeros(n, 2)),
         )
 
     @classmethod
@@ -109,11 +109,10 @@ class Boxes:
         """Return several sets of one frame as one."""
         return cls(*(torch.cat([getattr(b, f.name) for b in many]) for f in fields(cls))) if many else cls.empty()
 
-    def to(self, dtype: torch.dtype) -> Boxes:
-        """Return the same boxes in another floating-point type."""
-        return Boxes(
-            *(v.to(dtype) if v.is_floating_point() else v for v in (getattr(self, f.name) for f in fields(self)))
-        )
+    def to(self, dtype: torch.dtype | None = None, device: torch.device | None = None) -> Boxes:
+        """Return the same boxes in another floating-point type, or on another device, or both."""
+        values = (getattr(self, f.name) for f in fields(self))
+        return Boxes(*(v.to(device=device, dtype=dtype if v.is_floating_point() else None) for v in values))
 
     def transform(self, target_from_source: Transform) -> Boxes:
         """Return the same boxes in another frame; headings and velocities are projected onto the target's ground plane."""
@@ -155,6 +154,7 @@ class Boxes:
         unit = torch.tensor(
             [[x, y, z] for z in (-0.5, 0.5) for x, y in ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5))],
             dtype=self.center.dtype,
+            device=self.center.device,
         )
         local = unit * self.size[:, None, :]
         c, s = self.yaw.cos()[:, None], self.yaw.sin()[:, None]

@@ -60,17 +60,18 @@ class BevGrid:
 
     def centers(self, yx: Tensor) -> Tensor:
         """Metric centres (N, 2) as x, y of cells (N, 2) given as row, column. The inverse of :meth:`cells`."""
-        origin = torch.tensor([self.x_min, self.y_min], dtype=torch.float64)
+        origin = torch.tensor([self.x_min, self.y_min], dtype=torch.float64, device=yx.device)
         return (origin + (yx.flip(-1).double() * self.stride + 0.5) * self.pillar).float()
 
     def cells(self, xy: Tensor) -> Tensor:
         """Return row and column (N, 2) of the nearest cell centre of points (N, 2); clamped to the grid. See :meth:`contains`."""
-        origin = torch.tensor([self.x_min, self.y_min], dtype=torch.float64)
+        origin = torch.tensor([self.x_min, self.y_min], dtype=torch.float64, device=xy.device)
         nearest = (((xy.double() - origin) / self.pillar - 0.5) / self.stride + 0.5).floor().long().flip(-1)
-        return torch.minimum(nearest.clamp_min(0), torch.tensor(self.shape) - 1)
+        return torch.minimum(nearest.clamp_min(0), nearest.new_tensor(self.shape) - 1)
 
     def contains(self, points: Tensor) -> Tensor:
         """Return (N,) bool: which points (N, 2 or 3) lie within the range; half-open, [min, max)."""
-        low = torch.tensor([self.x_min, self.y_min, self.z_min], dtype=points.dtype)[: points.shape[-1]]
-        high = torch.tensor([self.x_max, self.y_max, self.z_max], dtype=points.dtype)[: points.shape[-1]]
+        axes = points.shape[-1]
+        low = points.new_tensor([self.x_min, self.y_min, self.z_min][:axes])
+        high = points.new_tensor([self.x_max, self.y_max, self.z_max][:axes])
         return ((points >= low) & (points < high)).all(-1)

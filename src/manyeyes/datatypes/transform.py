@@ -83,7 +83,7 @@ class Transform:
 
     def matrix(self) -> Tensor:
         """Homogeneous form (..., 4, 4)."""
-        bottom = torch.zeros(*self.translation.shape[:-1], 1, 4, dtype=self.rotation.dtype)
+        bottom = self.rotation.new_zeros(*self.translation.shape[:-1], 1, 4)
         bottom[..., 0, 3] = 1
         return torch.cat((torch.cat((self.rotation, self.translation[..., None]), -1), bottom), -2)
 
@@ -103,7 +103,7 @@ class Transform:
         points = as_tensor(points, "Transform.apply", None)
         if points.shape[-1:] != (3,):
             raise ShapeError(f"Transform.apply needs points (..., N, 3); got {tuple(points.shape)}.")
-        rotation, translation = self.rotation.to(points.dtype), self.translation.to(points.dtype)
+        rotation, translation = self.rotation.to(points), self.translation.to(points)
         return points @ rotation.mT + translation[..., None, :]
 
     def __getitem__(self, index: int | slice | Tensor) -> Transform:

@@ -127,13 +127,13 @@ def fingerprint(model: nn.Module) -> bytes:
     digest = hashlib.blake2b(config_to_json(model.config).encode(), digest_size=8)
     for name, value in sorted(_tensors(model).items()):
         digest.update(name.encode())
-        digest.update(value.detach().float().contiguous().numpy().tobytes())
+        digest.update(value.float().contiguous().numpy().tobytes())
     return digest.digest()
 
 
 def _tensors(model: nn.Module) -> dict[str, torch.Tensor]:
-    """Return the tensors that affect the output, so without the batch counters of normalisation layers."""
-    return {k: v for k, v in model.state_dict().items() if not k.endswith("num_batches_tracked")}
+    """Return the tensors that affect the output, on the CPU, so without the batch counters of normalisation layers."""
+    return {k: v.detach().cpu() for k, v in model.state_dict().items() if not k.endswith("num_batches_tracked")}
 
 
 def save(model: nn.Module, path: Path, card: dict[str, Any], half: bool = False, format: str = FORMAT) -> None:

@@ -20,11 +20,11 @@ NUM_SAMPLES = 16
 
 def measure_token_peaks(tokens: Iterable[Tensor], channels: int) -> list[float] | None:
     """Return the largest magnitude of each channel of tokens (N, channels); None without tokens."""
-    peaks, count = torch.zeros(channels), 0
+    peaks, count = torch.zeros(channels, device="cpu"), 0
     for features in tokens:
         count += len(features)
         if len(features):
-            peaks = torch.maximum(peaks, features.detach().abs().amax(0).float())
+            peaks = torch.maximum(peaks, features.detach().abs().amax(0).float().cpu())
     if not count:
         return None
     return [float(f"{peak:.4g}") for peak in peaks.tolist()]

@@ -42,15 +42,15 @@ def warp_bev(
 
 def _places(source: BevGrid, target: BevGrid, target_from_source: Transform) -> Tensor:
     """Return (N, H, W, 2) where the centres of target's cells lie in source, -1 and 1 being its outer borders; float64."""
-    rows, columns = target.shape
-    row, column = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+    (rows, columns), device = target.shape, target_from_source.translation.device
+    row, column = torch.meshgrid(torch.arange(rows, device=device), torch.arange(columns, device=device), indexing="ij")
     xy = target.centers(torch.stack((row, column), -1).view(-1, 2)).double()
     moved = xy - target_from_source.translation[:, None, :2].double()
     yaw = target_from_source.yaw.double()
     c, s = yaw.cos()[:, None], yaw.sin()[:, None]
     x, y = moved[..., 0] * c + moved[..., 1] * s, moved[..., 1] * c - moved[..., 0] * s
-    size = torch.tensor([source.shape[1], source.shape[0]], dtype=torch.float64)
-    origin = torch.tensor([source.x_min, source.y_min], dtype=torch.float64)
+    size = torch.tensor([source.shape[1], source.shape[0]], dtype=torch.float64, device=device)
+    origin = torch.tensor([source.x_min, source.y_min], dtype=torch.float64, device=device)
     cell = ((torch.stack((x, y), -1) - origin) / source.pillar - 0.5) / source.stride
     return ((2 * cell + 1) / size - 1).view(-1, rows, columns, 2)
 

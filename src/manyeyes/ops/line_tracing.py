@@ -63,7 +63,9 @@ def trace_lines(
     table = torch.cat((field.confidence[..., None], field.nearest_point, field.direction), -1).flatten(0, 2)
     here = table[(image_index * rows + cell[:, 0]) * columns + cell[:, 1]]
     confidence, start, direction = here[:, 0], here[:, 1:3], here[:, 3:5]
-    tracer = _Tracer(table, image_index, torch.tensor([columns, rows]), min_confidence, stride, max_strides)
+    tracer = _Tracer(
+        table, image_index, torch.tensor([columns, rows], device=table.device), min_confidence, stride, max_strides
+    )
     ahead, sure_ahead, closed = tracer.trace(start, direction, confidence >= min_confidence)
     back, sure_back, _ = tracer.trace(start, -direction, (confidence >= min_confidence) & ~closed)
     points = torch.cat((back.flip(1), start[:, None], ahead), 1)
@@ -116,7 +118,7 @@ def resample_evenly(lines: Tensor, count: int) -> Tensor:
     """
     step = lines.diff(dim=-2).norm(dim=-1)
     station = torch.cat((torch.zeros_like(step[..., :1]), step.cumsum(-1)), -1)
-    wanted = station[..., -1:] * torch.linspace(0, 1, count)
+    wanted = station[..., -1:] * torch.linspace(0, 1, count, device=lines.device)
     after = torch.searchsorted(station, wanted, right=True).clamp(1, lines.shape[-2] - 1)
     before = after - 1
     gone = wanted - station.gather(-1, before)

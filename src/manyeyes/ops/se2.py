@@ -143,7 +143,7 @@ def solve_pose_graph(
         gradient, curvature = gradient[free], curvature[free][:, free]
         while True:
             damped = curvature + (damping * curvature.diagonal().clamp_min(1e-9)).diag()
-            step = torch.zeros(poses.numel(), dtype=torch.float64)
+            step = poses.new_zeros(poses.numel())
             step[free] = -torch.linalg.solve(damped, gradient)
             moved = torch.where(fixed[:, None], poses, compose(poses, exp(step.view(-1, 3))))
             moved_cost = _cost(moved, edges, huber)
@@ -211,8 +211,8 @@ def _normal_equations(poses: Tensor, edges: PoseGraphEdges, huber: float | None)
     if huber is not None:
         size = _square_errors(error, edges).sqrt()
         information = information * torch.where(size > huber, huber / size.clamp_min(huber), 1.0)[:, None, None]
-    gradient = torch.zeros(n, 3, dtype=poses.dtype)
-    curvature = torch.zeros(n * n, 3, 3, dtype=poses.dtype)
+    gradient = poses.new_zeros(n, 3)
+    curvature = poses.new_zeros(n * n, 3, 3)
     sides = ((edges.i, by_i), (edges.j, by_j))
     for row, left in sides:
         weighted = left.mT @ information
@@ -224,14 +224,14 @@ def _normal_equations(poses: Tensor, edges: PoseGraphEdges, huber: float | None)
 
 def _covariance(poses: Tensor, edges: PoseGraphEdges, free: Tensor, huber: float | None) -> Tensor:
     """Return (3 N, 3 N) in x, y, yaw: the inverse of the curvature, turned from each pose's own axes to those of its frame."""
-    out = torch.zeros(poses.numel(), poses.numel(), dtype=poses.dtype)
+    out = poses.new_zeros(poses.numel(), poses.numel())
     curvature = _normal_equations(poses, edges, huber)[1][free][:, free]
     factor, failed = torch.linalg.cholesky_ex(curvature)
     weakest = float(factor.diagonal().min()) if len(free) else 1.0
     if int(failed) or weakest < 1e-7 * float(factor.diagonal().max() if len(free) else 1.0):
         return out + math.inf
     out[free[:, None], free] = torch.cholesky_inverse(factor)
-    turn = torch.zeros(len(poses), 3, 3, dtype=poses.dtype)
+    turn = poses.new_zeros(len(poses), 3, 3)
     turn[:, 2, 2] = 1
     c, s = poses[:, 2].cos(), poses[:, 2].sin()
     turn[:, 0, 0], turn[:, 0, 1], turn[:, 1, 0], turn[:, 1, 1] = c, -s, s, c

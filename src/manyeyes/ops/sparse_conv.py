@@ -38,7 +38,7 @@ def coalesce(
     """Scatter rows (N, C) at keys (N,) in any order to a sparse map; rows of one cell are reduced (max starts at -inf)."""
     rows, columns = grid.shape
     size = batch_size * rows * columns
-    if key.numel() and (int(key.min()) < 0 or int(key.max()) >= size):
+    if key.device.type == "cpu" and key.numel() and (int(key.min()) < 0 or int(key.max()) >= size):
         raise ShapeError(f"coalesce needs keys in [0, {size}); got {int(key.min())} … {int(key.max())}.")
     found, row = distinct(key, size)
     how = {"sum": segment_sum, "mean": segment_mean, "max": segment_max}

@@ -19,13 +19,13 @@ def bilinear(x: SparseBev, xy: Tensor) -> Tensor:
     if not len(keys):
         return x.features.new_zeros(len(xy), x.features.shape[1])
     rows, columns = grid.shape
-    origin = torch.tensor([grid.x_min, grid.y_min], dtype=torch.float64)
+    origin = torch.tensor([grid.x_min, grid.y_min], dtype=torch.float64, device=xy.device)
     place = ((xy.double() - origin) / grid.pillar - 0.5) / grid.stride
     low = place.floor()
     share = (place - low).to(x.features.dtype)
     total = x.features.new_zeros(len(xy), x.features.shape[1])
     for right, up in itertools.product((0, 1), (0, 1)):
-        column, row = (low + torch.tensor([right, up])).long().unbind(1)
+        column, row = (low + torch.tensor([right, up], device=xy.device)).long().unbind(1)
         key = row * columns + column
         at = torch.searchsorted(keys, key).clamp_max(len(keys) - 1)
         found = (keys[at] == key) & (row >= 0) & (row < rows) & (column >= 0) & (column < columns)

@@ -55,7 +55,7 @@ def pillar_sites(xyz: Tensor, batch: Tensor, grid: BevGrid, batch_size: int) -> 
     y = ((xyz[:, 1].double() - grid.y_min) / grid.pillar).floor().long()
     z = xyz[:, 2].double()
     inside = (x >= 0) & (x < columns) & (y >= 0) & (y < rows) & (z >= grid.z_min) & (z < grid.z_max)
-    key = ((batch * rows + y) * columns + x)[inside]
+    key = ((batch * rows + y) * columns + x).index_select(0, inside.nonzero()[:, 0])
     found, row = distinct(key, batch_size * rows * columns)
     return Pillars(Sites(found, grid, batch_size), inside, row)
 
@@ -101,12 +101,18 @@ def _sums(values: np.ndarray, row: np.ndarray, n: int) -> np.ndarray:  # pragma:
     return out
 
 
+def _count(row: Tensor, n: int) -> Tensor:
+    """Return (n,) int64: the size of each segment; off the CPU without waiting for the device, which bincount does."""
+    if row.device.type == "cpu":
+        return torch.bincount(row, minlength=n)
+    return row.new_zeros(n).index_add_(0, row, torch.ones_like(row))
+
+
 def segment_mean(values: Tensor, row: Tensor, n: int) -> Tensor:
     """Return (n, C): the mean of values (P, C) over segments row (P,) in [0, n); zero where a segment is empty."""
     if _in_numba(values) and values.dim() == 2 and not (torch.is_grad_enabled() and values.requires_grad):
         return torch.from_numpy(_means(values.numpy(), row.numpy(), n))
-    count = torch.bincount(row, minlength=n).clamp_min(1).to(values.dtype)
-    return segment_sum(values, row, n) / count[:, None]
+    return segment_sum(values, row, n) / _count(row, n).clamp_min(1).to(values.dtype)[:, None]
 
 
 @njit(cache=True, nogil=True)
@@ -193,7 +199,7 @@ def pillar_moments(xyz: Tensor, intensity: Tensor, row: Tensor, sites: Sites) ->
 
     A pillar without points has zeros.
     """
-    n, points = len(sites), torch.bincount(row, minlength=len(sites)).to(xyz.dtype)[:, None]
+    n, points = len(sites), _count(row, len(sites)).to(xyz.dtype)[:, None]
     count = points.clamp_min(1)
     local = torch.cat((xyz[:, :2] - sites.xy.to(xyz.dtype)[row], xyz[:, 2:], intensity[:, None]), 1)
     mean = segment_sum(local, row, n) / count

@@ -51,7 +51,7 @@ def window_places(
             window_offsets(xy, origin, window_m, cell_m, shift_m),
         )
     _check_window_size(window_m)
-    ids, offsets = torch.empty(len(xy), dtype=torch.int64), torch.empty(len(xy), 2)
+    ids, offsets = xy.new_empty(len(xy), dtype=torch.int64), xy.new_empty(len(xy), 2)
     where, whose = xy.contiguous().numpy(), batch.contiguous().numpy()
     windows = _WindowGrid(*map(float, (*origin, window_m, cell_m, shift_m)))
     _place(where, whose, windows, ids.numpy(), offsets.numpy())

@@ -13,7 +13,7 @@ from manyeyes.datatypes import PointCloud, Transform
 
 def mirror_factors(flip: bool, dtype: torch.dtype) -> Tensor:
     """Return the factors (3,) of x, y and z."""
-    return torch.tensor([1.0, -1.0 if flip else 1.0, 1.0], dtype=dtype)
+    return torch.tensor([1.0, -1.0 if flip else 1.0, 1.0], dtype=dtype, device="cpu")
 
 
 def resize_cloud(cloud: PointCloud, scale: float, flip: bool) -> PointCloud:

@@ -24,6 +24,10 @@ from torch import Tensor, nn
 from manyeyes._io import atomic_write, atomic_write_text, flush_files, name_errors
 from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.models import checkpoint
+from manyeyes.training.optimiser import AveragedWeights, clip_gradients, load_optimiser, make_optimiser, to_cpu
+
+STEPS_BETWEEN_READS = 10
+"""Off the CPU, losses are read, checked and logged every so many steps, and before a save: reading waits for the device."""
 
 Config = TypeVar("Config", bound="TrainConfig")
 Model = TypeVar("Model", bound=nn.Module)
@@ -116,28 +120,42 @@ class Progress:
         return {"step": self.step, "loss": round(self.loss, 5), **terms, "lr": self.learning_rate}
 
 
+@dataclass(frozen=True, eq=False)
+class _StepResult:
+    """What a step measured, still on the device: values (1 + terms,), the loss and the terms of these names."""
+
+    step: int
+    values: Tensor
+    names: tuple[str, ...]
+    rate: float
+    seconds: float
+
+
 class Trainer(Generic[Model, Sample]):
     """A resumable training run in a folder, of one process or of one of several that share every batch.
 
     The folder holds last.pt (training state), log.jsonl (one object per step) and weights.safetensors (float16). Two runs must not
     write to one folder at once: hold its lock (:func:`manyeyes._lock.hold_folder`), as ``manyeyes train`` does.
 
+    device: of the model; samples are drawn on the CPU. The state of a run can be resumed on any device.
+
     Raises:
         CheckpointError: the folder holds a run of another configuration, seed or initial weights, or a damaged state.
     """
 
-    def __init__(self, task: Task[Any, Model, Sample], folder: Path) -> None:
-        self.task, self.folder = task, folder
+    def __init__(self, task: Task[Any, Model, Sample], folder: Path, device: torch.device | str = "cpu") -> None:
+        self.task, self.folder, self.device = task, folder, torch.device(device)
         self.rank, self.world_size = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
         with torch.random.fork_rng():
             torch.manual_seed(task.seed)
             self.model = task.make_model()
+        begun = checkpoint.fingerprint(self.model).hex() if task.is_initialised else ""
+        self.model.to(self.device)
         self.average = copy.deepcopy(self.model).requires_grad_(False)
-        groups = parameter_groups(self.model, task.config.weight_decay)
-        self.optimiser = torch.optim.AdamW(groups, betas=(0.9, task.config.beta2))
+        self._averaged_weights = AveragedWeights(self.average, self.model)
+        self.optimiser = make_optimiser(self.model, task.config.weight_decay, task.config.beta2)
         self.step, self.seconds = 0, 0.0
         self.loss: float | None = None  # of the last step
-        begun = checkpoint.fingerprint(self.model).hex() if task.is_initialised else ""
         self._name = {"config": checkpoint.config_to_json(task.config), "seed": task.seed, "begun": begun}
         if self.path.exists():
             self._resume()
@@ -162,13 +180,18 @@ class Trainer(Generic[Model, Sample]):
         The first process writes the log and calls report at every step. SIGINT and SIGTERM end the run after its current step,
         which is saved.
         """
+        unread: list[_StepResult] = []
         with _defer_interrupts() as interrupted:
             while self.step < self.task.steps:
-                progress = self.advance()
-                if not self.rank:
-                    self._log(progress)
-                    report(progress)
-                if not self.step % self.task.config.save_every or self.step == self.task.steps or interrupted.is_set():
+                unread.append(self._advance())
+                is_due = not self.step % self.task.config.save_every or self.step == self.task.steps
+                if is_due or interrupted.is_set() or len(unread) >= self._steps_between_reads:
+                    for progress in self._read(unread):
+                        if not self.rank:
+                            self._log(progress)
+                            report(progress)
+                    unread = []
+                if is_due or interrupted.is_set():
                     self.save()
                 if interrupted.is_set():
                     raise KeyboardInterrupt
@@ -181,28 +204,53 @@ class Trainer(Generic[Model, Sample]):
 
     def advance(self) -> Progress:
         """Run one optimiser step."""
+        return self._read([self._advance()])[0]
+
+    def _advance(self) -> _StepResult:
+        """Run one optimiser step without waiting for what it measures."""
         config, began = self.task.config, time.monotonic()
         numbers = self._sample_numbers(config.batch)
         self.model.train()
-        total, parts = 0.0, []
+        total: Tensor | None = None
+        names: tuple[str, ...] = ()
         for part in _split(numbers, config.micro_batch or len(numbers)):
             samples = [self.task.draw(number) for number in part]
             loss, terms = self.task.loss(self.model, samples, part, self.step)
             fraction = len(part) / len(numbers)
-            total += self._backward(loss, fraction)
-            parts.append({name: fraction * value.detach() for name, value in terms.items()})
+            names = tuple(terms)
+            values = torch.stack([value.detach().to(self.device) for value in (loss, *terms.values())]) * fraction
+            total = values if total is None else total + values
+            if self.device.type == "cpu":
+                _check_loss(float(loss.detach()), self.step)
+            (loss * fraction).backward()
+        assert total is not None
         rate = config.learning_rate * warmup_cosine(config.warmup_steps, self.step, self.task.steps)
         self._optimiser_step(rate)
         self.seconds += time.monotonic() - began
-        self.loss = total
-        mean = {name: float(torch.stack([part[name] for part in parts]).sum()) for name in parts[0]}
-        return Progress(self.step, self.task.steps, total, mean, rate, self.seconds)
+        return _StepResult(self.step, total, names, rate, self.seconds)
+
+    @property
+    def _steps_between_reads(self) -> int:
+        return 1 if self.device.type == "cpu" else STEPS_BETWEEN_READS
+
+    def _read(self, results: Sequence[_StepResult]) -> list[Progress]:
+        """Read the loss and terms of steps, in one copy from the device.
+
+        Raises:
+            ConfigError: a loss is not finite.
+        """
+        found = []
+        for result, values in zip(results, torch.stack([result.values for result in results]).tolist()):
+            self.loss = _check_loss(values[0], result.step - 1)
+            terms = dict(zip(result.names, values[1:]))
+            found.append(Progress(result.step, self.task.steps, self.loss, terms, result.rate, result.seconds))
+        return found
 
     def save(self) -> None:
         """Save everything that is needed to resume as if uninterrupted, atomically."""
         if self.rank:
             return
-        parts = {name: getattr(self, name).state_dict() for name in ("model", "average", "optimiser")}
+        parts = {name: to_cpu(getattr(self, name).state_dict()) for name in ("model", "average", "optimiser")}
         # In memory first: torch reports a full disk as a RuntimeError without the file's name.
         content = io.BytesIO()
         torch.save({**self._name, **parts, "step": self.step, "seconds": self.seconds, "loss": self.loss}, content)
@@ -223,25 +271,15 @@ class Trainer(Generic[Model, Sample]):
         first = self.step * batch + self.rank * count
         return range(first, first + count)
 
-    def _backward(self, loss: Tensor, fraction: float) -> float:
-        """Accumulate the gradient of a loss that is this fraction of the step's; returns its part of the loss."""
-        value = float(loss.detach())
-        if not math.isfinite(value):
-            raise ConfigError(
-                f"The loss is {value} at step {self.step}; lower the learning rate, or resume from an older save."
-            )
-        (loss * fraction).backward()
-        return value * fraction
-
     def _optimiser_step(self, rate: float) -> None:
         """Step down the mean loss of all processes and update the averaged weights, faster at the start."""
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         self._average_gradients()
-        nn.utils.clip_grad_norm_(self.model.parameters(), self.task.config.max_grad_norm)
+        clip_gradients(self.model.parameters(), self.task.config.max_grad_norm)
         self.optimiser.step()
         self.optimiser.zero_grad(set_to_none=True)
-        self._update_average(min(self.task.config.ema_decay, (1 + self.step) / (10 + self.step)))
+        self._averaged_weights.update(min(self.task.config.ema_decay, (1 + self.step) / (10 + self.step)))
         self.step += 1
 
     def _average_gradients(self) -> None:
@@ -253,17 +291,9 @@ class Trainer(Generic[Model, Sample]):
         _mean_in_place([p.grad for p in self.model.parameters() if p.grad is not None], self.world_size)
         _mean_in_place([b for b in self.model.buffers() if b.is_floating_point()], self.world_size)
 
-    @torch.no_grad()
-    def _update_average(self, decay: float) -> None:
-        for mean, value in zip(self.average.state_dict().values(), self.model.state_dict().values()):
-            if mean.is_floating_point():
-                mean.lerp_(value, 1 - decay)
-            else:
-                mean.copy_(value)
-
     def _resume(self) -> None:
         try:
-            state = torch.load(self.path, weights_only=True)
+            state = torch.load(self.path, weights_only=True, map_location="cpu")
         except Exception as error:
             raise CheckpointError(
                 f"{self.path}: not a whole training state ({type(error).__name__}); delete it to start again."
@@ -273,21 +303,22 @@ class Trainer(Generic[Model, Sample]):
                 f"{self.path}: belongs to a run of another configuration or seed, or that began from other weights; give another "
                 "--out, or delete it."
             )
-        for name in ("model", "average", "optimiser"):
-            getattr(self, name).load_state_dict(state[name])
+        self.model.load_state_dict(state["model"])
+        self.average.load_state_dict(state["average"])
+        load_optimiser(self.optimiser, state["optimiser"])
         self.step, self.seconds, self.loss = state["step"], state["seconds"], state.get("loss")
-
-
-def parameter_groups(model: nn.Module, decay: float) -> list[dict[str, Any]]:
-    """Return optimiser groups: matrices with weight decay, and the other parameters without."""
-    matrices = [p for p in model.parameters() if p.dim() > 1]
-    rest = [p for p in model.parameters() if p.dim() <= 1]
-    return [{"params": matrices, "weight_decay": decay}, {"params": rest, "weight_decay": 0.0}]
 
 
 def warmup_cosine(warmup_steps: int, step: int, steps: int) -> float:
     """Return the learning rate as a fraction of its peak: linear warm-up over warmup_steps, times a cosine to zero."""
     return min(1.0, (step + 1) / max(1, warmup_steps)) * 0.5 * (1 + math.cos(math.pi * step / steps))
+
+
+def _check_loss(loss: float, step: int) -> float:
+    """Return a loss that is finite; ConfigError for any other."""
+    if not math.isfinite(loss):
+        raise ConfigError(f"The loss is {loss} at step {step}; lower the learning rate, or resume from an older save.")
+    return loss
 
 
 def _split(numbers: range, size: int) -> Iterator[range]:

@@ -85,13 +85,17 @@ class RawBoxes:
     def bev(self) -> Tensor:
         """Return (N, 5) x, y, length, width, axis yaw of every site's box, differentiable."""
         xy = self.sites.xy + self.offset * self.sites.grid.cell_size_m
-        size = torch.tensor(TYPICAL_SIZE[:2]) * self.log_size[:, :2].clamp(-3, 3).exp()
+        size = self.log_size.new_tensor(TYPICAL_SIZE[:2]) * self.log_size[:, :2].clamp(-3, 3).exp()
         return torch.cat((xy, size, axis_yaw(self.axis)[:, None]), 1)
 
-    def select(self, mask: Tensor) -> RawBoxes:
-        """Select a subset of the sites."""
-        sites = Sites(self.sites.key[mask], self.sites.grid, self.sites.batch_size)
-        return RawBoxes.of(self.to_rows()[mask], sites)
+    def select(self, rows: Tensor) -> RawBoxes:
+        """Select a subset of the sites by ascending rows (n,) int64."""
+        sites = Sites(self.sites.key.index_select(0, rows), self.sites.grid, self.sites.batch_size)
+        return RawBoxes.of(self.to_rows().index_select(0, rows), sites)
+
+    def on(self, sites: Sites) -> RawBoxes:
+        """Return the same outputs with an equal set of sites, on the device of that set."""
+        return self if self.sites is sites else RawBoxes.of(self.to_rows().to(sites.key.device), sites)
 
 
 def axis_yaw(axis: Tensor) -> Tensor:
@@ -177,11 +181,11 @@ def _boxes(raw: RawBoxes, rows: Tensor, score: Tensor) -> Boxes:
     yaw = axis_yaw(raw.axis[rows]) + math.pi * (right < 0.5)
     return Boxes(
         center=torch.cat((xy, raw.z[rows, None]), 1).detach(),
-        size=(torch.tensor(TYPICAL_SIZE) * raw.log_size[rows].clamp(-3, 3).exp()).detach(),
+        size=(raw.log_size.new_tensor(TYPICAL_SIZE) * raw.log_size[rows].clamp(-3, 3).exp()).detach(),
         yaw=torch.atan2(yaw.sin(), yaw.cos()).detach(),
         score=score[rows],
         label=raw.class_logits[rows].argmax(1),
-        id=torch.full((len(rows),), -1, dtype=torch.int64),
+        id=torch.full_like(rows, -1),
         sigma_xy=raw.log_sigma_xy[rows].exp().detach(),
         sigma_yaw=raw.log_sigma_yaw[rows].exp().detach(),
         p_flip=torch.minimum(right, 1 - right).detach(),

@@ -48,8 +48,8 @@ class Codebook(nn.Module):
     def __init__(self, channels: int, config: CodebookConfig) -> None:
         super().__init__()
         self.width = config.stages + PROPOSAL_CODES
-        self.register_buffer("centres", torch.zeros(config.stages, config.size, channels))
-        uniform = torch.full((self.width, 256), FREQUENCY_TOTAL // 256, dtype=torch.int16)
+        self.register_buffer("centres", torch.zeros(config.stages, config.size, channels, device="cpu"))
+        uniform = torch.full((self.width, 256), FREQUENCY_TOTAL // 256, dtype=torch.int16, device="cpu")
         self.register_buffer("frequencies", uniform)
 
     def encode(self, tokens: Tensor) -> Tensor:
@@ -57,7 +57,8 @@ class Codebook(nn.Module):
         features = tokens[:, :-PROPOSAL_DIM]
         if features.shape[1] != self.centres.shape[2]:
             raise ShapeError(f"This codebook is of {self.centres.shape[2]} features; got {features.shape[1]}.")
-        return torch.cat((residual_codes(features, self.centres), proposal_to_codes(tokens[:, -PROPOSAL_DIM:])), 1)
+        quantised = residual_codes(features.to(self.centres.device), self.centres).to(tokens.device)
+        return torch.cat((quantised, proposal_to_codes(tokens[:, -PROPOSAL_DIM:])), 1)
 
     def decode(self, codes: Tensor) -> Tensor:
         """Invert encode up to the quantisation error; any bytes (N, W) are valid."""
@@ -65,8 +66,8 @@ class Codebook(nn.Module):
         if codes.shape[1] != self.width:
             raise ShapeError(f"This codebook reads rows of {self.width} bytes; got {codes.shape[1]}.")
         # With fewer than 256 centres, higher byte values are never encoded, but must not break decoding.
-        index = codes[:, :stages].long().clamp_max(size - 1)
-        features = self.centres[torch.arange(stages), index].sum(1)
+        index = codes[:, :stages].long().clamp_max(size - 1).to(self.centres.device)
+        features = self.centres[torch.arange(stages, device=index.device), index].sum(1).to(codes.device)
         return torch.cat((features, proposal_from_codes(codes[:, stages:])), 1)
 
 

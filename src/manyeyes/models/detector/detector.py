@@ -85,6 +85,11 @@ class Detector(nn.Module):
         self.codebook = None if config.codebook is None else Codebook(channels, config.codebook)
 
     @property
+    def device(self) -> torch.device:
+        """The device of the weights; results are returned on the device of the inputs, so that agents keep to the CPU."""
+        return self.refine.out.weight.device
+
+    @property
     def token_grid(self) -> BevGrid:
         """The grid of the tokens."""
         return self.config.grid.at(self.config.encoder.head_stride)
@@ -106,10 +111,11 @@ class Detector(nn.Module):
 
     def extract_tokens(self, points: PointCloud, previous: PointCloud | None = None) -> tuple[SparseBev, RawBoxes]:
         """Encode one point cloud to the tokens that its agent shares (N, token_channels), and to raw boxes."""
-        before = PointCloud.of(torch.zeros(0, 3)) if previous is None else previous
+        before = points[:0] if previous is None else previous
         tokens = self.extract_features([points], [before]).tokens
         raw = self.predict(tokens)
-        return self.make_tokens(tokens, raw), raw
+        shared = self.make_tokens(tokens, raw).to(points.xyz.device)
+        return shared, raw.on(shared.sites)
 
     def extract_features(
         self,
@@ -139,12 +145,15 @@ class Detector(nn.Module):
 
     def score_tokens(self, tokens: SparseBev) -> Tensor:
         """Return importance logits (N,) of the tokens; under a budget the highest are sent."""
-        return self.selector(tokens)
+        return self.selector(tokens.to(self.device)).to(tokens.features.device)
 
     def fuse(self, tokens: Tokens, past: Tokens | None = None) -> tuple[FusedBev, RawBoxes]:
         """Fuse the tokens of all agents around each ego, its own included; and raw boxes in the ego's frame.
 
         past: the ego's tokens of earlier instants, transformed to its current frame.
         """
-        fused = self.fusion(tokens, past)
-        return fused, self.refine(fused.bev, fused.merged_proposals)
+        given = tokens.features.device
+        fused = self.fusion(tokens.to(self.device), None if past is None else past.to(self.device))
+        raw = self.refine(fused.bev, fused.merged_proposals)
+        fused = fused.to(given)
+        return fused, raw.on(fused.bev.sites)

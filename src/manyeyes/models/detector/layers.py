@@ -42,7 +42,8 @@ def fold_norm(weight: Tensor, norm: ActiveNorm) -> tuple[Tensor, Tensor]:
 
 def conv_weight(outputs: int, inputs: int, kernel: int) -> nn.Parameter:
     """Make an (outputs, inputs, kernel, kernel) kernel with He initialisation over its inputs * kernel^2 inputs."""
-    return _tap_by_tap(torch.randn(outputs, inputs, kernel, kernel) * math.sqrt(2.0 / (inputs * kernel * kernel)))
+    drawn = torch.randn(outputs, inputs, kernel, kernel, device="cpu")
+    return _tap_by_tap(drawn * math.sqrt(2.0 / (inputs * kernel * kernel)))
 
 
 def _tap_by_tap(weight: Tensor) -> nn.Parameter:
@@ -159,7 +160,7 @@ class UpLayer(nn.Module):
 
     def __init__(self, inputs: int, lateral: int, outputs: int) -> None:
         super().__init__()
-        weight = torch.randn(inputs, outputs, 3, 3) * math.sqrt(2.0 / (inputs * 9 / 4))
+        weight = torch.randn(inputs, outputs, 3, 3, device="cpu") * math.sqrt(2.0 / (inputs * 9 / 4))
         self.weight = nn.Parameter(_tap_by_tap(weight.transpose(0, 1)).data.transpose(0, 1))
         self.norm: nn.Module = ActiveNorm(outputs)
         self.lateral = nn.Linear(lateral, outputs, bias=False)

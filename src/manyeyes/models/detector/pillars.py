@@ -90,16 +90,17 @@ class PillarEncoder(nn.Module):
         """
         before = previous_clouds if previous_clouds is not None and self.sweeps == 2 else []
         many, agents = [*clouds, *before], [*range(len(clouds)), *range(len(before))]
-        if isinstance(self.net, PointPillars) and not self.training and not torch.is_grad_enabled() and _plain(many):
+        device = next(self.parameters()).device
+        is_inference = not self.training and not torch.is_grad_enabled()
+        if isinstance(self.net, PointPillars) and is_inference and device.type == "cpu" and _plain(many):
             return self.net.infer(clouds, before, self.grid)
-        if isinstance(self.net, MomentPillars) and _plain(many):
+        if isinstance(self.net, MomentPillars) and device.type == "cpu" and _plain(many):
             moments = cloud_moments(clouds, before, self.grid, self.sweeps)
             return moments.with_features(self.net.encode(moments.features))
-        xyz, intensities = (
-            _concatenate([cloud.xyz for cloud in many]),
-            _concatenate([cloud.intensity for cloud in many]),
-        )
-        batch = _concatenate([torch.full((len(cloud),), agent) for cloud, agent in zip(many, agents)])
+        numbers = [cloud.xyz.new_full((len(cloud),), agent, dtype=torch.int64) for cloud, agent in zip(many, agents)]
+        parts = ([cloud.xyz for cloud in many], [cloud.intensity for cloud in many], numbers)
+        # The clouds of a batch become three tensors first, so that three copies bring them to the device.
+        xyz, intensities, batch = (_concatenate(part).to(device, non_blocking=True) for part in parts)
         pillars = pillar_sites(xyz, batch, self.grid, len(clouds))
         kept = pillars.inside.nonzero()[:, 0]
         is_previous = kept >= sum(map(len, clouds))

@@ -48,13 +48,21 @@ def reset_origin(proposal: Tensor, shift: Tensor) -> Tensor:
 
 def move_proposal(proposal: Tensor, yaw: Tensor, height: Tensor) -> Tensor:
     """Transform proposals to a frame in which the sender has a scalar yaw and its ground the height (N,), metres."""
-    c, s = yaw.cos().to(proposal.dtype), yaw.sin().to(proposal.dtype)
-    once = torch.stack((torch.stack((c, s)), torch.stack((-s, c))))
-    twice = once @ once
-    moved = proposal.clone()
-    moved[:, BOX_LAYOUT.offset] = proposal[:, BOX_LAYOUT.offset] @ once
+    return turn_proposal(proposal, yaw.cos().to(proposal.dtype), yaw.sin().to(proposal.dtype), height)
+
+
+def turn_proposal(proposal: Tensor, cosine: Tensor, sine: Tensor, height: Tensor) -> Tensor:
+    """Do the same with the cosine and sine of the yaw, scalars or (N, 1) for senders of their own yaws."""
+    double = cosine * cosine - sine * sine, 2 * cosine * sine
+    once, moved = (cosine, sine), proposal.clone()
+    spans = (
+        (BOX_LAYOUT.offset, once),
+        (BOX_LAYOUT.axis, double),
+        (BOX_LAYOUT.direction, once),
+        (BOX_LAYOUT.velocity, once),
+    )
+    for span, (c, s) in spans:
+        x, y = proposal[:, span].split(1, 1)
+        moved[:, span] = torch.cat((x * c - y * s, x * s + y * c), 1)
     moved[:, BOX_LAYOUT.z] += height[:, None]
-    moved[:, BOX_LAYOUT.axis] = proposal[:, BOX_LAYOUT.axis] @ twice
-    moved[:, BOX_LAYOUT.direction] = proposal[:, BOX_LAYOUT.direction] @ once
-    moved[:, BOX_LAYOUT.velocity] = proposal[:, BOX_LAYOUT.velocity] @ once
     return moved

@@ -37,7 +37,7 @@ _SIGMA_LOW, _SIGMA_STEP = -4.0, 0.4
 def _table() -> tuple[Tensor, Tensor]:
     """Return columns of a proposal that are encoded one by one, and their quantisation steps."""
     pairs = [(column, step) for span, step in _STEPS for column in range(span.start, span.stop)]
-    return torch.tensor([c for c, _ in pairs]), torch.tensor([s for _, s in pairs])
+    return torch.tensor([c for c, _ in pairs], device="cpu"), torch.tensor([s for _, s in pairs], device="cpu")
 
 
 _COLUMNS, _COLUMN_STEPS = _table()
@@ -47,7 +47,8 @@ PROPOSAL_CODES = len(_COLUMNS) + 4
 
 def proposal_to_codes(proposal: Tensor) -> Tensor:
     """Encode proposals (N, PROPOSAL_DIM) to (N, PROPOSAL_CODES) uint8."""
-    single = _encode_signed(proposal[:, _COLUMNS], _COLUMN_STEPS)
+    columns, steps = (part.to(proposal.device) for part in (_COLUMNS, _COLUMN_STEPS))
+    single = _encode_signed(proposal[:, columns], steps)
     axis = torch.remainder(torch.round(axis_yaw(proposal[:, BOX_LAYOUT.axis]) * (256 / math.pi)), 256)
     facing = (proposal[:, BOX_LAYOUT.direction] * _along(axis)).sum(1)
     best = proposal[:, BOX_LAYOUT.class_logits].topk(2, dim=1)
@@ -68,13 +69,14 @@ def proposal_from_codes(codes: Tensor) -> Tensor:
     code = codes.float()
     axis, facing, kind, sigma = code[:, -4:].unbind(1)
     proposal = code.new_zeros(len(code), PROPOSAL_DIM)
-    proposal[:, _COLUMNS] = (code[:, :-4] - 128) * _COLUMN_STEPS
+    columns, steps = (part.to(code.device) for part in (_COLUMNS, _COLUMN_STEPS))
+    proposal[:, columns] = (code[:, :-4] - 128) * steps
     turn = axis * (2 * math.pi / 256)
     proposal[:, BOX_LAYOUT.axis] = torch.stack((turn.cos(), turn.sin()), 1)
     proposal[:, BOX_LAYOUT.direction] = ((facing - 128) * _FACING_STEP)[:, None] * _along(axis)
     # The middle of its step: never 0, so that the best class stays the best.
     lead = (torch.remainder(kind, _LEADS) + 0.5) * (_LEAD_STEP / 2)
-    named = torch.arange(len(VEHICLE_LABELS)) == kind.div(_LEADS, rounding_mode="floor")[:, None]
+    named = torch.arange(len(VEHICLE_LABELS), device=code.device) == kind.div(_LEADS, rounding_mode="floor")[:, None]
     proposal[:, BOX_LAYOUT.class_logits] = torch.where(named, lead[:, None], -lead[:, None])
     nibbles = torch.stack((sigma.div(16, rounding_mode="floor"), torch.remainder(sigma, 16)), 1)
     proposal[:, [BOX_LAYOUT.log_sigma_xy.start, BOX_LAYOUT.log_sigma_yaw.start]] = _SIGMA_LOW + _SIGMA_STEP * nibbles

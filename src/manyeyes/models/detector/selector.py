@@ -22,7 +22,7 @@ class Selector(nn.Module):
     def __init__(self, channels: int, hidden: int = 64) -> None:
         super().__init__()
         self.inner, self.outer = nn.Linear(channels + PROPOSAL_DIM + 1, hidden), nn.Linear(hidden, 1)
-        self.redundancy_weight = nn.Parameter(torch.tensor(-2.0))
+        self.redundancy_weight = nn.Parameter(torch.tensor(-2.0, device="cpu"))
         nn.init.zeros_(self.outer.weight)
         nn.init.zeros_(self.outer.bias)
 
@@ -32,7 +32,7 @@ class Selector(nn.Module):
         proposal = rows[:, -PROPOSAL_DIM:]
         heat = proposed_heat(proposal)
         rank = rank_in_group(target_cell_keys(tokens.sites.xy, proposal, tokens.sites.batch, tokens.grid), heat).log1p()
-        inputs = torch.cat((rows[:, :-PROPOSAL_DIM], proposal * PROPOSAL_SCALE, rank[:, None]), 1)
+        inputs = torch.cat((rows[:, :-PROPOSAL_DIM], proposal * PROPOSAL_SCALE.to(proposal.device), rank[:, None]), 1)
         learned = self.outer(torch.relu(self.inner(inputs)))[:, 0]
         return heat + self.redundancy_weight * rank + learned
 
@@ -42,8 +42,7 @@ def rank_in_group(key: Tensor, value: Tensor) -> Tensor:
     by_value = value.sort(descending=True, stable=True).indices
     group, by_key = key[by_value].sort(stable=True)
     order = by_value[by_key]
-    count = torch.unique_consecutive(group, return_counts=True)[1]
-    start = torch.repeat_interleave(count.cumsum(0) - count, count)
-    rank = torch.empty_like(value)
-    rank[order] = (torch.arange(len(key), device=key.device) - start).to(value.dtype)
-    return rank
+    place = torch.arange(len(key), device=key.device)
+    is_first = torch.cat((group[:1] == group[:1], group[1:] != group[:-1]))
+    start = torch.where(is_first, place, 0).cummax(0).values if len(key) else place
+    return torch.empty_like(value).index_copy_(0, order, (place - start).to(value.dtype))

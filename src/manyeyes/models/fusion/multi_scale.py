@@ -37,7 +37,7 @@ class MultiScaleFusion(nn.Module):
         self.coarse_scales = nn.ModuleList(CoarseScale(channels, 2**level) for level in range(1, levels))
         self.out = nn.Linear(levels * channels, channels, bias=False)
         with torch.no_grad():
-            self.out.weight.copy_(torch.eye(channels, levels * channels))
+            self.out.weight.copy_(torch.eye(channels, levels * channels, device="cpu"))
 
     def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
         """Fuse the tokens of all agents to one feature and one box per cell; past is ignored."""

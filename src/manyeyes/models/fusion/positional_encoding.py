@@ -35,7 +35,7 @@ class SpatioTemporalEncoding(nn.Module):
         context = (
             tokens.pose_context[:, :FRAME_CONTEXT_DIM],
             cell_offset,
-            tokens.proposal * PROPOSAL_SCALE,
+            tokens.proposal * PROPOSAL_SCALE.to(features.device),
             tokens.pose_context[:, FRAME_CONTEXT_DIM:],
         )
         when = temporal_encoding(tokens.age, features.shape[1])

@@ -33,6 +33,10 @@ class FusedBev:
     bev: SparseBev
     merged_proposals: Tensor
 
+    def to(self, device: torch.device) -> FusedBev:
+        """Return the same on a device."""
+        return FusedBev(self.bev.to(device), self.merged_proposals.to(device))
+
 
 def assign_cells(tokens: Tokens) -> tuple[Tensor, Tensor]:
     """Return the key (N,) of the cell of each token, and the token's offset (N, 2) from that cell's centre, in cells."""
@@ -72,7 +76,7 @@ class TokenMerge(nn.Module):
         self.inner = nn.Linear(BOX_LAYOUT.velocity.start + 4, 2 * channels)
         self.outer = nn.Linear(2 * channels, channels, bias=False)
         with torch.no_grad():
-            self.proposal_weight.weight.copy_(torch.tensor([[1.0, 1.0, -1.0]]))
+            self.proposal_weight.weight.copy_(torch.tensor([[1.0, 1.0, -1.0]], device="cpu"))
         nn.init.zeros_(self.feature_weight.weight)
 
     def forward(self, features: Tensor, tokens: Tokens, key: Tensor, cell_offset: Tensor) -> FusedBev:
@@ -95,7 +99,9 @@ class TokenMerge(nn.Module):
         away = (boxes[:, BOX_LAYOUT.offset] - merged_proposals[row][:, BOX_LAYOUT.offset]) ** 2
         met = segment_sum(torch.cat((torch.ones_like(score), score), 1), row, n).log1p()
         apart = segment_sum(weight * away, row, n).clamp_max(1)
-        statistics = torch.cat(((merged_proposals * PROPOSAL_SCALE)[:, : BOX_LAYOUT.velocity.start], met, apart), 1)
+        statistics = torch.cat(
+            ((merged_proposals * PROPOSAL_SCALE.to(features.device))[:, : BOX_LAYOUT.velocity.start], met, apart), 1
+        )
         features = features * tokens.selection_mask[:, None]
         merged = segment_max(features, row, n) if self.reduce == "max" else segment_sum(weight * features, row, n)
         merged = merged + self.outer(torch.relu(self.inner(statistics)))
@@ -103,7 +109,7 @@ class TokenMerge(nn.Module):
 
 
 def _proposal_scale() -> Tensor:
-    scale = torch.ones(PROPOSAL_DIM)
+    scale = torch.ones(PROPOSAL_DIM, device="cpu")
     for logits in (BOX_LAYOUT.heatmap_logit, BOX_LAYOUT.iou_logit, BOX_LAYOUT.class_logits, BOX_LAYOUT.direction):
         scale[logits] = 0.25
     return scale

@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, Transform
-from manyeyes.models.detector.proposal import PROPOSAL_DIM, move_proposal, proposed_velocity
+from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_velocity, turn_proposal
 
 POSE_CONTEXT_DIM = 5
 MAX_SPEED_MPS = 40.0
@@ -66,6 +66,13 @@ class Tokens:
     grid: BevGrid
     batch_size: int
 
+    def to(self, device: torch.device) -> Tokens:
+        """Return the same tokens on a device."""
+        if self.features.device == device:
+            return self
+        names = ("features", "xy", "ego", "pose_context", "proposal", "selection_mask")
+        return replace(self, **{name: getattr(self, name).to(device) for name in names})
+
     @property
     def sigma_m(self) -> Tensor:
         """(N,) position standard deviations, metres."""
@@ -83,9 +90,13 @@ def rotate_vectors(features: Tensor, yaw: Tensor) -> Tensor:
     The first half of the channels are (x, y) pairs of vectors in the sender's frame; the second half are scalars and
     stay.
     """
+    return _rotate_pairs(features, yaw.cos().to(features.dtype), yaw.sin().to(features.dtype))
+
+
+def _rotate_pairs(features: Tensor, c: Tensor, s: Tensor) -> Tensor:
+    """Rotate the vector channels by the angle of this cosine and sine, scalars or (N, 1)."""
     channels = features.shape[1]
     pairs = features[:, : channels // 2].reshape(features.shape[0], channels // 4, 2)
-    c, s = yaw.cos().to(features.dtype), yaw.sin().to(features.dtype)
     turned = torch.stack((pairs[..., 0] * c - pairs[..., 1] * s, pairs[..., 0] * s + pairs[..., 1] * c), -1)
     return torch.cat((turned.flatten(1), features[:, channels // 2 :]), 1)
 
@@ -94,36 +105,55 @@ def to_ego_frame(agent_tokens: Iterable[AgentTokens], grid: BevGrid, batch_size:
     """Transform the tokens of all agents to their egos' frames and drop those outside the ego's range; grid: of all
     tokens.
     """
-    columns = [_transform_part(part, grid) for part in agent_tokens]
-    features, places, egos, cues, proposals, kept = (torch.cat(column) for column in zip(*columns))
-    return Tokens(features, places, egos, cues, proposals, kept, grid, batch_size)
-
-
-def _transform_part(part: AgentTokens, grid: BevGrid) -> tuple[Tensor, ...]:
-    feature, proposal, xy = part.tokens[:, :-PROPOSAL_DIM], part.tokens[:, -PROPOSAL_DIM:], part.xy
-    n = feature.shape[0]
-    ego = torch.full((n,), part.ego, dtype=torch.int64, device=feature.device)
-    selection_mask = feature.new_ones(n) if part.selection_mask is None else part.selection_mask
-    if part.ego_from_sender is None:
-        return feature, xy, ego, feature.new_zeros(n, POSE_CONTEXT_DIM), proposal, selection_mask
-    if part.age_s:
-        velocity = proposed_velocity(proposal)
-        xy = xy + velocity * part.age_s * (velocity.norm(dim=1, keepdim=True) <= MAX_SPEED_MPS)
-    yaw = part.ego_from_sender.yaw
-    moved = part.ego_from_sender.apply(torch.cat((xy, xy.new_zeros(n, 1)), 1).double())
+    parts = list(agent_tokens)
+    sizes, device = [part.tokens.shape[0] for part in parts], parts[0].tokens.device
+    tokens, xy = torch.cat([part.tokens for part in parts]), torch.cat([part.xy for part in parts])
+    masks = [
+        part.tokens.new_ones(size) if part.selection_mask is None else part.selection_mask
+        for part, size in zip(parts, sizes)
+    ]
+    number = torch.arange(len(parts), device="cpu").repeat_interleave(torch.tensor(sizes, device="cpu"))
+    # All numbers of all senders go to the device in one copy, and their tokens are transformed together.
+    link = _describe_links(parts).to(device).index_select(0, number.to(device))
+    feature, proposal = tokens[:, :-PROPOSAL_DIM], tokens[:, -PROPOSAL_DIM:]
+    is_own, age_s = link[:, 0] > 0, link[:, 2:3].to(feature.dtype)
+    velocity = proposed_velocity(proposal)
+    driven = velocity * age_s * (velocity.norm(dim=1, keepdim=True) <= MAX_SPEED_MPS)
+    xy = torch.where(age_s > 0, xy + driven, xy)
+    rotation, translation = link[:, 8:17].unflatten(1, (3, 3)), link[:, 17:]
+    x, y = xy.double()[:, :1], xy.double()[:, 1:]
+    moved = rotation[:, :, 0] * x + rotation[:, :, 1] * y + translation
     height = moved[:, 2].to(feature.dtype)
-    sigma_m = (part.sigma_xy_m**2 + (part.sigma_yaw_rad * xy.norm(dim=1)) ** 2).sqrt()
-    same = torch.stack((yaw.sin(), yaw.cos() - 1)).to(feature.dtype).expand(n, 2)
-    age = torch.full_like(sigma_m, part.age_s / 0.1)
-    pose_context = torch.cat((height[:, None], same, sigma_m[:, None], age[:, None]), 1)
-    xy = moved[:, :2].float()
-    near = grid.contains(xy)
+    sigma_xy_m, sigma_yaw_rad, sine, cosine, less = link[:, 3:8].to(feature.dtype).split(1, 1)
+    sigma_m = (sigma_xy_m**2 + (sigma_yaw_rad * xy.norm(dim=1, keepdim=True)) ** 2).sqrt()
+    pose_context = torch.cat((height[:, None], sine, less, sigma_m, (link[:, 2:3] / 0.1).to(feature.dtype)), 1)
+    pose_context = pose_context.masked_fill(is_own[:, None], 0.0)
+    xy = torch.where(is_own[:, None], xy, moved[:, :2].float())
     columns = (
-        rotate_vectors(feature, yaw),
+        _rotate_pairs(feature, cosine, sine),
         xy,
-        ego,
+        link[:, 1].long(),
         pose_context,
-        move_proposal(proposal, yaw, height),
-        selection_mask,
+        turn_proposal(proposal, cosine, sine, height),
+        torch.cat(masks),
     )
-    return tuple(column[near] for column in columns)
+    rows = (is_own | grid.contains(xy)).nonzero()[:, 0]
+    feature, xy, ego, pose_context, proposal, mask = (column.index_select(0, rows) for column in columns)
+    return Tokens(feature, xy, ego, pose_context, proposal, mask, grid, batch_size)
+
+
+def _describe_links(parts: Sequence[AgentTokens]) -> Tensor:
+    """Return (parts, 20) float64 on the CPU.
+
+    Whether the tokens are the ego's current ones, the number of the ego, age, both sigmas, sine, cosine and cosine - 1 of the
+    yaw, rotation (9), translation (3).
+    """
+    own = Transform.identity()
+    motions = [own if part.ego_from_sender is None else part.ego_from_sender.double() for part in parts]
+    motion = Transform(torch.stack([m.rotation for m in motions]), torch.stack([m.translation for m in motions]))
+    numbers = [
+        (part.ego_from_sender is None, part.ego, part.age_s, part.sigma_xy_m, part.sigma_yaw_rad) for part in parts
+    ]
+    given = torch.tensor(numbers, dtype=torch.float64, device="cpu")
+    yaw = motion.yaw[:, None]
+    return torch.cat((given, yaw.sin(), yaw.cos(), yaw.cos() - 1, motion.rotation.flatten(1), motion.translation), 1)

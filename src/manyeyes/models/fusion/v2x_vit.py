@@ -56,7 +56,7 @@ class AgentAttention(nn.Module):
         self.heads = heads
         self.query, self.key, self.value, self.out = (PerAgentType(channels) for _ in range(4))
         d = channels // heads
-        same = torch.eye(d).expand(NUM_AGENT_TYPES, NUM_AGENT_TYPES, heads, d, d)
+        same = torch.eye(d, device="cpu").expand(NUM_AGENT_TYPES, NUM_AGENT_TYPES, heads, d, d)
         self.attention_matrix, self.message_matrix = nn.Parameter(same.clone()), nn.Parameter(same.clone())
         _zero_init(self.out)
 

@@ -87,13 +87,14 @@ def rasterise_clouds(clouds: Sequence[PointCloud], grid: BevGrid) -> tuple[Tenso
     The channels are the twelve scaled moments of a pillar and its occupancy; empty pillars are zero.
     """
     cloud = PointCloud.cat(list(clouds))
-    batch = torch.repeat_interleave(torch.arange(len(clouds)), torch.tensor([len(c) for c in clouds]))
+    device = cloud.xyz.device
+    batch = torch.cat([torch.full((len(c),), agent, device=device) for agent, c in enumerate(clouds)])
     pillars = pillar_sites(cloud.xyz, batch, grid, len(clouds))
     kept = pillars.inside
     moments = pillar_moments(cloud.xyz[kept], cloud.intensity[kept], pillars.row, pillars.sites)
     rows, columns = grid.shape
-    raster = torch.zeros(len(clouds) * rows * columns, len(MOMENTS) + 1)
-    raster[pillars.sites.key, :-1] = moments * torch.tensor(_SCALE)
+    raster = moments.new_zeros(len(clouds) * rows * columns, len(MOMENTS) + 1)
+    raster[pillars.sites.key, :-1] = moments * moments.new_tensor(_SCALE)
     raster[pillars.sites.key, -1] = 1.0
     # channels_last makes convolutions on the CPU about 1.5 times as fast.
     raster = raster.view(len(clouds), rows, columns, -1).permute(0, 3, 1, 2)
@@ -157,8 +158,10 @@ class CameraBev(_RasterEncoder):
         flat = [image for one in images for image in one]
         if not flat:
             shape = config.token_grid.shape
-            return torch.zeros(len(images), config.channels, *shape), torch.zeros(len(images), *shape, dtype=torch.bool)
-        owner = torch.repeat_interleave(torch.arange(len(images)), torch.tensor([len(one) for one in images]))
+            nothing = self.project.weight.new_zeros(len(images), config.channels, *shape)
+            return nothing, nothing[:, 0] > 0
+        owners = [agent for agent, one in enumerate(images) for _ in one]
+        owner = torch.tensor(owners, device=self.project.weight.device)
         height, width = config.image_size
         cameras = [image.camera.resize(width, height) for image in flat]
         rig = AgentCameras(cameras, owner, len(images))
@@ -172,7 +175,7 @@ class CameraBev(_RasterEncoder):
             raster, seen = lift_depth(features, depth, rig, grid, stride, config.depth_bins, config.heights_m)
         # The image resolution of a cell depends on its position.
         rows, columns = grid.shape
-        y, x = torch.meshgrid(torch.linspace(-1, 1, rows), torch.linspace(-1, 1, columns), indexing="ij")
+        y, x = torch.meshgrid(*(torch.linspace(-1, 1, n, device=raster.device) for n in (rows, columns)), indexing="ij")
         raster = torch.cat((raster, torch.stack((x, y)).expand(len(images), 2, rows, columns)), 1)
         near = F.max_pool2d(seen[:, None].float(), 3, 2, 1)[:, 0] > 0
         return self.encode(raster.contiguous(memory_format=torch.channels_last)), near

@@ -42,7 +42,7 @@ QueryGroup = Literal["one", "many"]
 MOVE_SCALE = 0.1
 """Point displacement of one output unit, as a fraction of the tile."""
 
-_FREQUENCIES = math.pi * 2.0 ** torch.arange(8)
+_FREQUENCIES = math.pi * 2.0 ** torch.arange(8, device="cpu")
 
 
 @dataclass(frozen=True)
@@ -128,10 +128,10 @@ class DeformableAttention(nn.Module):
         self.value, self.out = nn.Linear(channels, channels), nn.Linear(channels, channels)
         self.offset, self.weight = nn.Linear(channels, heads * num_points * 2), nn.Linear(channels, heads * num_points)
         # Heads start with offsets in as many directions, one cell farther per sampling point.
-        angle = torch.arange(heads) * (2 * math.pi / heads)
+        angle = torch.arange(heads, device="cpu") * (2 * math.pi / heads)
         ring = torch.stack((angle.cos(), angle.sin()), -1)
         ring = ring / ring.abs().amax(-1, keepdim=True)
-        steps = ring[:, None] * torch.arange(1, num_points + 1)[:, None]
+        steps = ring[:, None] * torch.arange(1, num_points + 1, device="cpu")[:, None]
         nn.init.zeros_(self.offset.weight)
         nn.init.zeros_(self.weight.weight)
         nn.init.zeros_(self.weight.bias)
@@ -188,10 +188,10 @@ class MapHead(nn.Module):
         self.config = config
         c = config.channels
         self.line_field_head = LineFieldHead(c, len(config.kinds))
-        self.class_embedding = nn.Parameter(torch.randn(len(config.kinds), 2 * c))
-        self.point_embedding = nn.Parameter(torch.randn(config.num_points, 2 * c))
+        self.class_embedding = nn.Parameter(torch.randn(len(config.kinds), 2 * c, device="cpu"))
+        self.point_embedding = nn.Parameter(torch.randn(config.num_points, 2 * c, device="cpu"))
         if config.num_learned_queries:
-            self.query_embedding = nn.Parameter(torch.randn(config.num_learned_queries, 2 * c))
+            self.query_embedding = nn.Parameter(torch.randn(config.num_learned_queries, 2 * c, device="cpu"))
             self.start_points = nn.Parameter(make_start_lines(config.num_learned_queries, config.num_points))
         self.position_encoder = nn.Sequential(nn.Linear(4 * len(_FREQUENCIES), c), nn.ReLU(), nn.Linear(c, c))
         self.layers = nn.ModuleList(MapDecoderLayer(config) for _ in range(config.layers))
@@ -228,7 +228,7 @@ class MapHead(nn.Module):
         Queries from the line field come first and carry no gradient.
         """
         config = self.config
-        rings = torch.tensor([is_ring(kind) for kind in config.kinds])
+        rings = torch.tensor([is_ring(kind) for kind in config.kinds], device=line_field.line_logit.device)
         count, apart = (
             (config.num_queries - config.num_learned_queries, DUPLICATE_DISTANCE)
             if group == "one"
@@ -253,11 +253,12 @@ def make_start_lines(count: int, points: int) -> Tensor:
 
     Centres and directions are a low-discrepancy additive recurrence in three dimensions (Roberts 2018).
     """
-    ratio = torch.tensor(1.2207440846).double() ** -torch.arange(1, 4)
-    x, y, way = ((0.5 + torch.arange(count)[:, None] * ratio) % 1).unbind(-1)
+    ratio = torch.tensor(1.2207440846, device="cpu").double() ** -torch.arange(1, 4, device="cpu")
+    x, y, way = ((0.5 + torch.arange(count, device="cpu")[:, None] * ratio) % 1).unbind(-1)
     unit = torch.stack(((math.pi * way).cos(), (math.pi * way).sin()), -1)
     middle = 0.1 + 0.8 * torch.stack((x, y), -1)
-    return (middle[:, None] + torch.linspace(-0.15, 0.15, points)[:, None] * unit[:, None]).clamp(0, 1).float()
+    along = torch.linspace(-0.15, 0.15, points, device="cpu")[:, None]
+    return (middle[:, None] + along * unit[:, None]).clamp(0, 1).float()
 
 
 def encode_position(place: Tensor) -> Tensor:

@@ -77,7 +77,7 @@ class LineFieldHead(nn.Module):
             self.out.weight.mul_(0.1)
             # Few cells have a line or an end: prior probability 0.05.
             if self.out.bias is not None:
-                self.out.bias.copy_(torch.where(torch.arange(7 * kinds) < 2 * kinds, -math.log(19), 0.0))
+                self.out.bias.copy_(torch.where(torch.arange(7 * kinds, device="cpu") < 2 * kinds, -math.log(19), 0.0))
 
     def forward(self, ground: Tensor) -> RawLineField:
         """Predict the line field of features (B, C, rows, columns)."""
@@ -113,7 +113,7 @@ def propose_lines(
     place = (score * torch.where(peak, 1.0, 1e-3)).flatten(1).topk(num_seeds).indices
     kind, cell = place // (rows * columns), place % (rows * columns)
     cell = torch.stack((cell // columns, cell % columns), -1)
-    picture = torch.arange(b)[:, None] * kinds + kind
+    picture = torch.arange(b, device=kind.device)[:, None] * kinds + kind
     strides = math.ceil((rows + columns) / TRACE_STEP)
     traced = trace_lines(
         _decode_field(line_field, score), picture.flatten(), cell.flatten(0, 1), min_score, TRACE_STEP, strides
@@ -130,7 +130,7 @@ def propose_lines(
     on = (distance_to_lines(start, line) < duplicate_distance) & (kind[:, :, None] == kind[:, None])
     is_unique = suppress_duplicates(on, order)
     best = torch.where(is_unique, total, total - 4.0 * (rows + columns)).topk(count).indices
-    point = drawn.gather(1, best[..., None, None].expand(-1, -1, num_points, 2)) / torch.tensor([columns, rows])
+    point = drawn.gather(1, best[..., None, None].expand(-1, -1, num_points, 2)) / drawn.new_tensor([columns, rows])
     held = torch.where(is_unique, mean, DUPLICATE_SCORE).gather(1, best).clamp(DUPLICATE_SCORE, 1 - DUPLICATE_SCORE)
     return LineProposals(point, kind.gather(1, best), held)
 
@@ -149,7 +149,8 @@ def outline_rectangles(first: Tensor, last: Tensor, half_width: Tensor, points: 
 
 def _decode_field(line_field: RawLineField, score: Tensor) -> TracingField:
     rows, columns = score.shape[-2:]
-    row, column = torch.meshgrid(torch.arange(rows) + 0.5, torch.arange(columns) + 0.5, indexing="ij")
+    places = (torch.arange(n, device=score.device) + 0.5 for n in (rows, columns))
+    row, column = torch.meshgrid(*places, indexing="ij")
     foot = torch.stack((column, row)) + line_field.offset_to_line.clamp(-MAX_LINE_OFFSET, MAX_LINE_OFFSET)
     angle = torch.atan2(line_field.direction[:, :, 1], line_field.direction[:, :, 0]) / 2
     way = torch.stack((angle.cos(), angle.sin()), -1)

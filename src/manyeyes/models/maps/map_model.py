@@ -80,7 +80,7 @@ class MapModel(nn.Module):
         self.token_projection = nn.Conv2d(bev.channels, tokens, 1)
         self.line_classifier = nn.Linear(tokens, len(head.kinds))
         nn.init.constant_(self.line_classifier.bias, -3.0)
-        self.empty_feature = nn.Parameter(torch.zeros(tokens))
+        self.empty_feature = nn.Parameter(torch.zeros(tokens, device="cpu"))
         widths = tuple(min(head.channels, 2 * tokens * 2**i) for i in range(len(config.neck_blocks)))
         # Inputs beside the features: the number of frames that observed the cell, and its coordinates in the tile.
         inputs, stages = tokens + 3, []
@@ -96,8 +96,8 @@ class MapModel(nn.Module):
         # Per class, set after training (training/maps/score_calibration.py), so that scores are calibrated
         # probabilities.
         self.logit_scale, self.logit_shift = (
-            nn.Buffer(torch.ones(len(head.kinds))),
-            nn.Buffer(torch.zeros(len(head.kinds))),
+            nn.Buffer(torch.ones(len(head.kinds), device="cpu")),
+            nn.Buffer(torch.zeros(len(head.kinds), device="cpu")),
         )
 
     @property
@@ -149,7 +149,7 @@ class MapModel(nn.Module):
         """
         rows, columns = self.config.tile.shape
         dense = tokens.dense()
-        there = torch.zeros(dense.shape[0] * dense.shape[2] * dense.shape[3], dtype=torch.bool)
+        there = dense.new_zeros(dense.shape[0] * dense.shape[2] * dense.shape[3], dtype=torch.bool)
         there[tokens.sites.key] = True
         moved, seen = warp_bev(
             dense, there.view(dense.shape[0], *dense.shape[2:]), tokens.grid, self.config.tile, tile_from_agent
@@ -159,7 +159,7 @@ class MapModel(nn.Module):
         max_frames = int(place.max()) + 1 if len(tile_index) else 1
         slot = tile_index * max_frames + place
         features = moved.new_zeros(num_tiles * max_frames, moved.shape[1], rows, columns).index_copy(0, slot, moved)
-        views = torch.zeros(num_tiles * max_frames, rows, columns, dtype=torch.bool).index_copy(0, slot, seen)
+        views = seen.new_zeros(num_tiles * max_frames, rows, columns).index_copy(0, slot, seen)
         return features.unflatten(0, (num_tiles, max_frames)), views.unflatten(0, (num_tiles, max_frames))
 
     def fuse_features(self, features: Tensor, seen: Tensor) -> Tensor:
@@ -167,7 +167,7 @@ class MapModel(nn.Module):
         fused = masked_max(features, seen, self.empty_feature)
         coverage = seen.sum(1, keepdim=True).to(fused.dtype).log1p()
         b, _, rows, columns = fused.shape
-        y, x = torch.meshgrid(torch.linspace(-1, 1, rows), torch.linspace(-1, 1, columns), indexing="ij")
+        y, x = torch.meshgrid(*(torch.linspace(-1, 1, n, device=fused.device) for n in (rows, columns)), indexing="ij")
         x = torch.cat((fused, coverage, torch.stack((x, y)).expand(b, 2, rows, columns)), 1)
         x = x.contiguous(memory_format=torch.channels_last)
         levels = []

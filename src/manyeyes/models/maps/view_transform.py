@@ -79,12 +79,13 @@ class _LiftGeometry:
     stride: int
 
 
-def _project_cells(cameras: Sequence[Camera], geometry: _LiftGeometry) -> _ProjectedCells:
+def _project_cells(cameras: Sequence[Camera], geometry: _LiftGeometry, device: torch.device) -> _ProjectedCells:
     """Project ground cells at height_m above the road to the features of each camera."""
     found = [_cells_in(_camera_key(camera), camera.width, camera.height, geometry) for camera in cameras]
     cells, places, depths = (pad_sequence(list(part), batch_first=True) for part in zip(*found))
-    valid = torch.arange(cells.shape[1]) < torch.tensor([[len(one[0])] for one in found])
-    return _ProjectedCells(cells, places, depths, valid)
+    counts = torch.tensor([[len(one[0])] for one in found], device="cpu")
+    valid = torch.arange(cells.shape[1], device="cpu") < counts
+    return _ProjectedCells(*(part.to(device) for part in (cells, places, depths, valid)))
 
 
 def _camera_key(camera: Camera) -> tuple[float, ...]:
@@ -98,18 +99,18 @@ def _cells_in(
     key: tuple[float, ...], width: int, height: int, geometry: _LiftGeometry
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return cells (M,), places (M, 2) and depths (M,) of one camera, cached, as the rig is constant over frames."""
-    values = torch.tensor(key, dtype=torch.float64)
+    values = torch.tensor(key, dtype=torch.float64, device="cpu")
     camera = Camera(values[:9].view(3, 3), Transform(values[9:18].view(3, 3), values[18:]), width, height)
     rows, columns = geometry.grid.shape
-    row, column = torch.meshgrid(torch.arange(rows), torch.arange(columns), indexing="ij")
+    row, column = torch.meshgrid(*(torch.arange(n, device="cpu") for n in (rows, columns)), indexing="ij")
     xy = geometry.grid.centers(torch.stack((row, column), -1).view(-1, 2)).double()
-    points = torch.cat((xy, torch.full((len(xy), 1), geometry.height_m, dtype=torch.float64)), 1)
+    points = torch.cat((xy, xy.new_full((len(xy), 1), geometry.height_m)), 1)
     pixel, depth = camera.project(points)
     inside = (depth > MIN_DEPTH_M) & (pixel >= 0).all(-1) & (pixel[:, 0] <= width) & (pixel[:, 1] <= height)
     if geometry.max_pixel_footprint_m < math.inf:
         inside &= _pixel_footprint(camera, points) <= geometry.max_pixel_footprint_m
     cell = inside.nonzero()[:, 0]
-    size = torch.tensor(geometry.features[::-1], dtype=torch.float64)
+    size = torch.tensor(geometry.features[::-1], dtype=torch.float64, device="cpu")
     return cell, ((2 * (pixel[cell] - 0.5) / geometry.stride + 1) / size - 1).float(), depth[cell].float()
 
 
@@ -141,7 +142,8 @@ def lift_ground(
         Features (agents, C, rows, columns), zero where not observed, and the observed mask.
     """
     _check(features, rig)
-    projected = _project_cells(rig.cameras, _LiftGeometry(grid, 0.0, max_pixel_footprint_m, _size(features), stride))
+    geometry = _LiftGeometry(grid, 0.0, max_pixel_footprint_m, _size(features), stride)
+    projected = _project_cells(rig.cameras, geometry, features.device)
     return _average_cameras([(projected, projected.valid, _sample(features, projected.place))], rig, grid)
 
 
@@ -168,7 +170,8 @@ def lift_depth(
         )
     found = []
     for height_m in heights_m:
-        projected = _project_cells(rig.cameras, _LiftGeometry(grid, height_m, math.inf, _size(features), stride))
+        geometry = _LiftGeometry(grid, height_m, math.inf, _size(features), stride)
+        projected = _project_cells(rig.cameras, geometry, features.device)
         bin_at = (projected.depth_m - bins.near_m) / (bins.far_m - bins.near_m) * (bins.num_bins - 1)
         deep = torch.cat((projected.place, (2 * bin_at[..., None] + 1) / bins.num_bins - 1), -1)
         likelihood = _sample(depth[:, None], deep[:, None])
@@ -195,8 +198,8 @@ def _average_cameras(
     rows, columns = grid.shape
     cells, channels = rows * columns, found[0][2].shape[2]
     total = found[0][2].new_zeros(num_agents * cells, channels)
-    visible = torch.zeros(len(agent_of_camera), cells, dtype=torch.bool)
-    camera = torch.arange(len(agent_of_camera))[:, None]
+    visible = total.new_zeros(len(agent_of_camera), cells, dtype=torch.bool)
+    camera = torch.arange(len(agent_of_camera), device=total.device)[:, None]
     for projected, within, values in found:
         total = total.index_add(0, (agent_of_camera[:, None] * cells + projected.cell)[within], values[within])
         visible[camera.expand_as(within)[within], projected.cell[within]] = True

@@ -80,7 +80,7 @@ class BoxKeypointNet(nn.Module):
         turn = -boxes.yaw.float().repeat_interleave(sample_xy.shape[1])[:, None]
         around = torch.cat((rotate_vectors(sampled[:, :-1], turn), sampled[:, -1:]), 1)
         around = around.unflatten(0, sample_xy.shape[:2]).flatten(1)
-        size = (boxes.size.float() / torch.tensor(TYPICAL_SIZE)).clamp_min(1e-3).log()
+        size = (boxes.size.float() / rows.new_tensor(TYPICAL_SIZE)).clamp_min(1e-3).log()
         box_features = torch.cat((size, boxes.score[:, None].float(), boxes.sigma_xy[:, None].float().clamp(0, 4)), 1)
         descriptor = self.net(self.inner(torch.cat((around, box_features), 1)))
         return Keypoints(boxes, functional.normalize(descriptor))
@@ -89,7 +89,7 @@ class BoxKeypointNet(nn.Module):
         """Return the sample positions (N, samples, 2) relative to the box centres, metres in the agent's axes."""
         config = self.config
         longitudinal, lateral = (
-            (torch.arange(n) - (n - 1) / 2) * config.sample_spacing_m
+            (torch.arange(n, device=yaw.device) - (n - 1) / 2) * config.sample_spacing_m
             for n in (config.num_longitudinal_samples, config.num_lateral_samples)
         )
         x, y = (v.flatten() for v in torch.meshgrid(longitudinal, lateral, indexing="ij"))

@@ -63,7 +63,8 @@ class FeakmNet(nn.Module):
     def match(self, ego_keypoints: KeypointBatch, other_keypoints: KeypointBatch) -> Matches:
         """Match the keypoints of one view each by descriptors and relative geometry, without a prior pose."""
         if not ego_keypoints.mask.any() or not other_keypoints.mask.any():
-            return Matches(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0))
+            none = ego_keypoints.xy.new_zeros(0)
+            return Matches(none.new_zeros(0, 2, dtype=torch.int64), none)
         return Matches(
             *find_mutual_matches(self.matcher(ego_keypoints, other_keypoints)[-1], self.config.matcher.min_match_prob)[
                 0

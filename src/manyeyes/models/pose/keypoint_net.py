@@ -170,7 +170,7 @@ def _sample_descriptors(described: Tensor, yx: Tensor) -> Tensor:
     Uses SuperPoint's formula, which maps the centre of the first stride to the corner of the map.
     """
     h, w = described.shape[1:]
-    extent = torch.tensor([w, h]) * DESCRIPTOR_STRIDE - DESCRIPTOR_STRIDE / 2 - 0.5
+    extent = torch.tensor([w, h], device=described.device) * DESCRIPTOR_STRIDE - DESCRIPTOR_STRIDE / 2 - 0.5
     place = (yx.flip(1).to(described.dtype) - DESCRIPTOR_STRIDE / 2 + 0.5) / extent * 2 - 1
     sampled = functional.grid_sample(described[None], place[None, None], mode="bilinear", align_corners=True)
     return functional.normalize(sampled[0, :, 0].T)

@@ -80,7 +80,7 @@ class KeypointBatch:
             pad([k.xy for k in keypoints]),
             pad([k.boxes.yaw for k in keypoints]),
             pad([k.boxes.size[:, :2] for k in keypoints]),
-            pad([torch.ones(len(k)) for k in keypoints]).bool(),
+            pad([k.xy.new_ones(len(k)) for k in keypoints]).bool(),
         )
 
 
@@ -100,10 +100,10 @@ def find_mutual_matches(assignment: Assignment, min_prob: float) -> list[tuple[T
     found = []
     for log_p in assignment.log_p:
         if not log_p.numel():
-            found.append((torch.zeros(0, 2, dtype=torch.int64), log_p.new_zeros(0)))
+            found.append((log_p.new_zeros(0, 2, dtype=torch.int64), log_p.new_zeros(0)))
             continue
         best, j = log_p.max(1)
-        i = torch.arange(len(log_p))
+        i = torch.arange(len(log_p), device=log_p.device)
         rows = (log_p.argmax(0)[j] == i) & (best.exp() > min_prob)
         found.append((torch.stack((i[rows], j[rows]), 1), best[rows].exp()))
     return found

@@ -43,7 +43,7 @@ class NeighbourGeometryEncoder(nn.Module):
         """Encode xy (B, N, 2) m, yaw (B, N) rad, size (B, N, 2) m with mask (B, N) to (B, N, width)."""
         distance = torch.cdist(xy, xy)
         near = mask[:, :, None] & mask[:, None] & (distance < self.config.max_distance_m)
-        near &= ~torch.eye(xy.shape[1], dtype=torch.bool)
+        near &= ~torch.eye(xy.shape[1], dtype=torch.bool, device=xy.device)
         related = self.relation_net(relative_geometry(xy, yaw, size, distance)) * near[..., None]
         maximum = related.amax(2) if xy.shape[1] else related.sum(2)
         return self.out(torch.cat((maximum, related.sum(2) / 8), -1))
@@ -54,7 +54,7 @@ def relative_geometry(xy: Tensor, yaw: Tensor, size: Tensor, distance: Tensor) -
     delta = xy[:, None] - xy[:, :, None]
     bearing = 2 * (torch.atan2(delta[..., 1], delta[..., 0]) - yaw[:, :, None])
     turn = 2 * (yaw[:, None] - yaw[:, :, None])
-    phase = distance[..., None] * (2 * torch.pi / torch.tensor(WAVELENGTHS_M))
+    phase = distance[..., None] * (2 * torch.pi / distance.new_tensor(WAVELENGTHS_M))
     angles = torch.stack((bearing.cos(), bearing.sin(), turn.cos(), turn.sin()), -1)
     other = (size / 5).clamp(0, 4)[:, None].expand(*distance.shape, 2)
     return torch.cat((phase.cos(), phase.sin(), angles, other), -1)

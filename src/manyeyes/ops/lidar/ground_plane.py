@@ -80,13 +80,13 @@ class GroundPlane:
 
     def levelled_from_points(self) -> Transform:
         """Return the motion that puts the plane at z = 0: the smallest rotation, which turns no heading, then a shift along z."""
-        normal = torch.tensor([-self.slope_x, -self.slope_y, 1.0], dtype=torch.float64)
+        normal = torch.tensor([-self.slope_x, -self.slope_y, 1.0], dtype=torch.float64, device="cpu")
         length = float(normal.norm())
         a, b, c = (normal / length).tolist()
         # Rodrigues' formula about (b, -a, 0), from the normal to +z.
         rotation = [[1 - a * a / (1 + c), -a * b / (1 + c), -a], [-a * b / (1 + c), 1 - b * b / (1 + c), -b], [a, b, c]]
-        shift = torch.tensor([0.0, 0.0, -self.height_m / length], dtype=torch.float64)
-        return Transform(torch.tensor(rotation, dtype=torch.float64), shift)
+        shift = torch.tensor([0.0, 0.0, -self.height_m / length], dtype=torch.float64, device="cpu")
+        return Transform(torch.tensor(rotation, dtype=torch.float64, device="cpu"), shift)
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ def k_means(x: Tensor, size: int, key: tuple[int | str, ...], iterations: int = 
         centres = total / count.clamp_min(1)[:, None]
         empty = (count == 0).nonzero()[:, 0]
         worst = error.topk(min(len(empty), len(x))).indices
-        centres[empty] = x[worst[torch.arange(len(empty)) % max(1, len(worst))]]
+        centres[empty] = x[worst[torch.arange(len(empty), device=x.device) % max(1, len(worst))]]
     return centres
 
 

@@ -83,26 +83,27 @@ class LossTerms:
 def centre_focal(logit: Tensor, heat: Tensor, positive: Tensor) -> Tensor:
     """CornerNet's penalty-reduced focal loss (alpha 2, beta 4) over sites, divided by max(1, number of positives)."""
     p = torch.sigmoid(logit).clamp(1e-4, 1 - 1e-4)
-    gain = -((1 - p) ** 2 * p.log())[positive].sum()
-    rest = -((1 - heat) ** 4 * p**2 * (1 - p).log())[~positive].sum()
-    return (gain + rest) / positive.sum().clamp_min(1)
+    gain = (1 - p) ** 2 * p.log()
+    rest = (1 - heat) ** 4 * p**2 * (1 - p).log()
+    return -torch.where(positive, gain, rest).sum() / positive.sum().clamp_min(1)
 
 
-def prune_focal(pruned: PruneOutput, near: Tensor, alpha: float = 0.25, gamma: float = 2.0) -> Tensor:
+def prune_focal(pruned: PruneOutput, near: Tensor, num_boxes: int, alpha: float = 0.25, gamma: float = 2.0) -> Tensor:
     """Sigmoid focal loss (Lin et al. 2017) on whether a cell lies near an object, divided by max(1, number of such
     cells).
 
-    near: (N,), of find_nearby_objects. Every object has equal weight, however many cells it covers, because pruning a
+    near: (N,), of find_nearby_objects, rows of num_boxes boxes.
+    Every object has equal weight, however many cells it covers, because pruning a
     few cells removes a
     small object.
     """
-    found, row, cells = near.unique(return_inverse=True, return_counts=True)
-    is_near = near >= 0
-    number, objects = is_near.sum(), (found >= 0).sum()
+    is_near, row = near >= 0, near + 1
+    cells = row.new_zeros(num_boxes + 1).index_add_(0, row, torch.ones_like(row))
+    number, objects = is_near.sum(), (cells[1:] > 0).sum()
     cell_weight = (number / (objects.clamp_min(1) * cells[row])).clamp_max(MAX_CELL_WEIGHT)
     p = torch.sigmoid(pruned.logit)
     right = torch.where(is_near, p, 1 - p)
-    share = torch.where(is_near, alpha * cell_weight, torch.as_tensor(1 - alpha))
+    share = torch.where(is_near, alpha * cell_weight, 1 - alpha)
     entropy = functional.binary_cross_entropy_with_logits(pruned.logit, is_near.to(p.dtype), reduction="none")
     return (share * (1 - right) ** gamma * entropy).sum() / number.clamp_min(1)
 
@@ -114,17 +115,13 @@ def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor, mask_l1: Tensor, 
     if not len(rows):
         zero = raw.heatmap_logit.sum() * 0
         return LossTerms(heat, zero, zero, zero, zero, zero, zero, zero, prune, mask_l1, information)
-    some, truth, weight = (
-        raw.select(targets.box >= 0),
-        targets.boxes[targets.box[rows]].to(torch.float32),
-        targets.weight[rows],
-    )
+    some, truth, weight = raw.select(rows), targets.boxes[targets.box[rows]].to(torch.float32), targets.weight[rows]
 
     def mean(value: Tensor) -> Tensor:
         return (value * weight).sum() / weight.sum()
 
     offset = (truth.center[:, :2] - some.sites.xy) / some.sites.grid.cell_size_m
-    log_size = (truth.size / torch.tensor(TYPICAL_SIZE)).log()
+    log_size = (truth.size / truth.size.new_tensor(TYPICAL_SIZE)).log()
     axis = torch.stack(((2 * truth.yaw).cos(), (2 * truth.yaw).sin()), 1)
     off = (some.offset - offset).abs().sum(1) + (some.z - truth.center[:, 2]).abs() * 0.2
     shape = off + (some.log_size - log_size).abs().sum(1) + (some.axis - axis).abs().sum(1) * 0.5

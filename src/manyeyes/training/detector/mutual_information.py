@@ -39,20 +39,22 @@ def mutual_information_loss(tokens: SparseBev, mask: Tensor, relevance: Tensor) 
     features = functional.normalize(tokens.features[:, :-PROPOSAL_DIM].detach(), dim=1)
     grid = tokens.grid
     ids = window_ids(tokens.sites.xy, tokens.sites.batch, (grid.x_min, grid.y_min), WINDOW_CELLS * grid.cell_size_m)
-    row = ids.unique(return_inverse=True)[1]
-    return mask.mean(), window_mutual_information(features, mask, relevance, row)
+    found, row = ids.unique(return_inverse=True)
+    return mask.mean(), window_mutual_information(features, mask, relevance, row, len(found))
 
 
-def window_mutual_information(features: Tensor, mask: Tensor, relevance: Tensor, row: Tensor) -> Tensor:
+def window_mutual_information(
+    features: Tensor, mask: Tensor, relevance: Tensor, row: Tensor, windows: int | None = None
+) -> Tensor:
     """Return the symmetric InfoNCE, scalar, between the masked and the relevant part of each window; features (N, C), row (N,)
-    windows.
+    windows, and how many of them, None to count.
 
     z^X is the window mean of mask * feature, not divided by the sum of the mask. z^Y is that of relevance * feature
     and carries no gradient.
     Windows without relevant tokens are negatives only.
     """
-    windows = int(row.max()) + 1
-    count = torch.bincount(row, minlength=windows).to(mask.dtype)[:, None]
+    windows = int(row.max()) + 1 if windows is None else windows
+    count = mask.new_zeros(windows, 1).index_add_(0, row, torch.ones_like(mask)[:, None])
     x = segment_sum(mask[:, None] * features, row, windows) / count.sqrt()
     y = segment_sum(relevance[:, None] * features, row, windows).detach() / count.sqrt()
     some = (segment_sum(relevance[:, None], row, windows)[:, 0] > 0.5).nonzero()[:, 0]
@@ -87,7 +89,7 @@ def receiver_mutual_information(pairs: AgentPairTokens) -> Tensor:
         return pairs.sent_mask.sum() * 0
     x = segment_sum(pairs.sent_mask[:, None] * pairs.sent, pairs.sent_row, windows)[both] / sent[both, None].sqrt()
     y = segment_sum(pairs.own, pairs.own_row, windows)[both].detach() / own[both, None].sqrt()
-    return _info_nce(x, y, torch.arange(len(both)))
+    return _info_nce(x, y, torch.arange(len(both), device=both.device))
 
 
 def paper_mutual_information(pairs: AgentPairTokens) -> Tensor:
@@ -100,7 +102,7 @@ def paper_mutual_information(pairs: AgentPairTokens) -> Tensor:
     joint = segment_sum(pairs.sent_mask[:, None] * pairs.sent, pairs.sent_row, windows)
     z = functional.normalize(joint + segment_sum(pairs.own, pairs.own_row, windows).detach(), dim=1)
     z = z[torch.unique(torch.cat((pairs.sent_row, pairs.own_row)))]
-    return functional.cross_entropy(z @ z.mT / TEMPERATURE, torch.arange(len(z)))
+    return functional.cross_entropy(z @ z.mT / TEMPERATURE, torch.arange(len(z), device=z.device))
 
 
 STUDY_TARGETS = {"receiver": receiver_mutual_information, "literal": paper_mutual_information}

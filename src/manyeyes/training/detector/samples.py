@@ -318,7 +318,7 @@ class _AugmentedScene:
         pose, cloud = self.pose(back + 1, agent_id), self.cloud(back + 1, agent_id)
         is_single = self._sensors is not None and self._sensors.sensor(agent_id).is_single_sweep
         if pose is None or cloud is None or is_single:
-            return PointCloud.of(torch.zeros(0, 3))
+            return PointCloud.of(torch.zeros(0, 3, device="cpu"))
         return cloud.transform(frame.inverse() @ pose)
 
 
@@ -334,7 +334,7 @@ def _displaced(pose: Transform, off: np.ndarray | None) -> Transform:
     if off is None:
         return pose
     turn = Transform.from_xyz_yaw(0.0, 0.0, 0.0, float(off[2])).rotation.to(pose.rotation.dtype)
-    shift = torch.tensor([off[0], off[1], 0.0], dtype=pose.translation.dtype)
+    shift = torch.tensor([off[0], off[1], 0.0], dtype=pose.translation.dtype, device="cpu")
     return Transform(turn @ pose.rotation, pose.translation + shift)
 
 

@@ -138,7 +138,7 @@ def _draw_sensor(config: SensorAugmentConfig, common: IntensityLaw | None, rng: 
     spurious = float((rng.random() < config.spurious_prob) * config.max_spurious_fraction * rng.random())
     roll, pitch = config.max_tilt_rad * rng.uniform(-1, 1, 2)
     height_m = config.max_height_error_m * rng.uniform(-1, 1)
-    zero = torch.zeros((), dtype=torch.float64)
+    zero = torch.zeros((), dtype=torch.float64, device="cpu")
     error = Transform.from_rpy(zero.new_tensor([0.0, 0.0, height_m]), zero + roll, zero + pitch, zero)
     return AgentSensor(common or own, is_single, spurious, error)
 

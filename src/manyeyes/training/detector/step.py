@@ -3,14 +3,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-from manyeyes.datatypes import Boxes, SparseBev
+from manyeyes.datatypes import Sites, SparseBev
 from manyeyes.models.detector.box_head import RawBoxes
 from manyeyes.models.detector.detector import Detector, ExtractedFeatures
 from manyeyes.models.fusion.transform_tokens import AgentTokens, to_ego_frame
@@ -25,7 +26,7 @@ from manyeyes.training.detector.mutual_information import (
     mutual_information_loss,
 )
 from manyeyes.training.detector.samples import AgentView, Sample
-from manyeyes.training.detector.targets import TargetConfig, assign_targets, find_nearby_objects
+from manyeyes.training.detector.targets import BoxBatch, TargetConfig, assign_targets, find_nearby_objects
 
 TOKENS_PER_PACKET = 8
 """Number of tokens lost together: a packet of 1,398 bytes holds about as many float16 features."""
@@ -59,20 +60,12 @@ def forward(model: Detector, samples: list[Sample], prune_threshold: float | Non
     shared = model.make_tokens(seen.tokens, alone)
     score = model.score_tokens(shared)
     mask = torch.sigmoid(score)
-    parts, number = [], 0
-    batch, xy = shared.sites.batch, shared.sites.xy
-    for ego, sample in enumerate(samples):
-        for i, view in enumerate(sample.views):
-            rows = (batch == number).nonzero()[:, 0]
-            part = _agent_tokens(ego, view, shared.features, xy)
-            if not i:
-                part = replace(part, ego_from_sender=None, tokens=shared.features[rows], xy=xy[rows])
-            else:
-                rows = _select_delivered(rows, score.detach(), view, (*sample.key, i))
-                kept = None if view.max_tokens is None else 1 + mask[rows] - mask[rows].detach()
-                part = replace(part, tokens=shared.features[rows], xy=xy[rows], selection_mask=kept)
-            parts.append(part)
-            number += 1
+    links = [
+        _Link(ego, view, (*sample.key, i), is_own=not i)
+        for ego, sample in enumerate(samples)
+        for i, view in enumerate(sample.views)
+    ]
+    parts = _deliver(shared, links, score, mask)
     ego_history, sender_history = (
         _history_tokens(model, samples, which, prune_threshold) for which in ("ego_history", "sender_history")
     )
@@ -81,13 +74,60 @@ def forward(model: Detector, samples: list[Sample], prune_threshold: float | Non
     return ForwardOutput(seen, alone, model.fuse(tokens, ego_past)[1], shared, mask)
 
 
-def _agent_tokens(ego: int, view: AgentView, features: Tensor, xy: Tensor) -> AgentTokens:
-    return AgentTokens(ego, features, xy, view.ego_from_view, view.age_s, view.sigma_xy_m, view.sigma_yaw_rad)
+@dataclass(frozen=True)
+class _Link:
+    """How the tokens of a view reach an ego: its number in the batch, the key of random draws, and whether they are its own current
+    ones, which nothing degrades.
+    """
+
+    ego: int
+    view: AgentView
+    key: tuple[int | str, ...]
+    is_own: bool = False
+
+
+def _deliver(shared: SparseBev, links: list[_Link], score: Tensor, mask: Tensor | None) -> list[AgentTokens]:
+    """Return what arrives of the tokens of each view, a grid of the batch; mask (N,): of the selector, for its gradient."""
+    sizes, device = count_sites(shared.sites), score.device
+    is_whole = all(link.is_own or _is_complete(link.view) for link in links)
+    features, xy = shared.features, shared.sites.xy
+    masks: list[Tensor | None] = [None] * len(links)
+    if not is_whole:
+        # What arrives is drawn on the CPU, so that the device is asked once and not once a view.
+        drawn, chosen = score.detach().cpu(), list[Tensor]()
+        for rows, link in zip(torch.arange(len(drawn), device="cpu").split(sizes), links):
+            chosen.append(rows if link.is_own else _select_delivered(rows, drawn, link.view, link.key))
+        sizes, rows = [len(part) for part in chosen], torch.cat(chosen).to(device)
+        features, xy = features.index_select(0, rows), xy.index_select(0, rows)
+        if mask is not None:
+            kept = mask.index_select(0, rows)
+            parts = (1 + kept - kept.detach()).split(sizes)
+            masks = [None if link.is_own or link.view.max_tokens is None else part for link, part in zip(links, parts)]
+    split = zip(links, features.split(sizes), xy.split(sizes), masks)
+    return [_agent_tokens(link, own, place, kept) for link, own, place, kept in split]
+
+
+def _is_complete(view: AgentView) -> bool:
+    return view.max_tokens is None and not view.loss_fraction
+
+
+def _agent_tokens(link: _Link, features: Tensor, xy: Tensor, mask: Tensor | None = None) -> AgentTokens:
+    view = link.view
+    motion = None if link.is_own else view.ego_from_view
+    return AgentTokens(link.ego, features, xy, motion, view.age_s, view.sigma_xy_m, view.sigma_yaw_rad, mask)
+
+
+def count_sites(sites: Sites) -> list[int]:
+    """Return the number of sites of each grid of the batch."""
+    rows, columns = sites.grid.shape
+    ends = torch.arange(1, sites.batch_size + 1, device=sites.key.device) * (rows * columns)
+    total = torch.searchsorted(sites.key, ends).tolist()
+    return [after - before for before, after in pairwise([0, *total])]
 
 
 def _select_delivered(rows: Tensor, score: Tensor, view: AgentView, key: tuple[int | str, ...]) -> Tensor:
-    """Select the rows of a view's tokens that fit its budget and are not lost, packet by packet."""
-    if view.max_tokens is None and not view.loss_fraction:
+    """Select the rows of a view's tokens that fit its budget and are not lost, packet by packet; all on the CPU."""
+    if _is_complete(view):
         return rows
     rng = keyed_generator("arriving", *key)
     if view.max_tokens is not None:
@@ -95,7 +135,7 @@ def _select_delivered(rows: Tensor, score: Tensor, view: AgentView, key: tuple[i
         noise = torch.from_numpy(rng.gumbel(size=len(rows))).float()
         order = (score[rows] + 0.5 * noise).sort(descending=True, stable=True).indices
         rows = rows[order[: view.max_tokens]]
-    packet = torch.arange(len(rows)) // TOKENS_PER_PACKET
+    packet = torch.arange(len(rows), device="cpu") // TOKENS_PER_PACKET
     luck = torch.from_numpy(rng.random(int(packet[-1]) + 1 if len(rows) else 0))
     return rows[luck[packet] >= view.loss_fraction].sort().values
 
@@ -113,13 +153,9 @@ def _history_tokens(
         return []
     seen = model.extract_features([v.cloud for _, v in views], [v.previous_cloud for _, v in views], prune_threshold)
     shared = model.make_tokens(seen.tokens, model.predict(seen.tokens))
-    score, batch, xy = model.score_tokens(shared), shared.sites.batch, shared.sites.xy
-    parts = []
-    for number, (ego, view) in enumerate(views):
-        key = (*samples[ego].key, _HISTORY_KEYS[which], number)
-        rows = _select_delivered((batch == number).nonzero()[:, 0], score, view, key)
-        parts.append(_agent_tokens(ego, view, shared.features[rows], xy[rows]))
-    return parts
+    keys = [(*samples[ego].key, _HISTORY_KEYS[which], number) for number, (ego, _) in enumerate(views)]
+    links = [_Link(ego, view, key) for (ego, view), key in zip(views, keys)]
+    return _deliver(shared, links, model.score_tokens(shared), None)
 
 
 def loss_terms(
@@ -136,11 +172,11 @@ def loss_terms(
     fusion_weight: fraction of the former. target: reference of the selector's mutual information.
     """
     out = forward(model, samples, prune_threshold)
-    listed: list[Boxes] = [view.visible_boxes for sample in samples for view in sample.views]
-    union = [sample.merged_gt_boxes for sample in samples]
-    prune = torch.stack(
-        [prune_focal(p, find_nearby_objects(p.sites, listed, targets)) for p in out.features.pruned]
-    ).mean()
+    device = out.mask.device
+    listed = BoxBatch.of([view.visible_boxes for sample in samples for view in sample.views], device)
+    union = BoxBatch.of([sample.merged_gt_boxes for sample in samples], device)
+    found = ((pruned, find_nearby_objects(pruned.sites, listed, targets)) for pruned in out.features.pruned)
+    prune = torch.stack([prune_focal(pruned, near, len(listed.boxes)) for pruned, near in found]).mean()
     own = assign_targets(out.single_agent_boxes.sites, listed, targets)
     kept, information = mutual_information_loss(out.shared_tokens, out.mask, own.heat)
     if target != "own_task":
@@ -154,13 +190,12 @@ def pair_agent_tokens(out: ForwardOutput, samples: list[Sample]) -> AgentPairTok
     """Pair the collaborators' tokens with the egos' own in windows of the egos' frames; only the mask carries a
     gradient.
     """
-    shared, batch, xy = out.shared_tokens, out.shared_tokens.sites.batch, out.shared_tokens.sites.xy
+    shared, xy, sizes = out.shared_tokens, out.shared_tokens.sites.xy, count_sites(out.shared_tokens.sites)
     views = [(ego, i, view) for ego, sample in enumerate(samples) for i, view in enumerate(sample.views)]
     sides: tuple[list[AgentTokens], list[AgentTokens]] = ([], [])
-    for number, (ego, i, view) in enumerate(views):
-        rows = batch == number
-        part = _agent_tokens(ego, view, shared.features[rows].detach(), xy[rows])
-        sides[i > 0].append(replace(part, selection_mask=out.mask[rows]))
+    columns = zip(shared.features.detach().split(sizes), xy.split(sizes), out.mask.split(sizes))
+    for (ego, i, view), column in zip(views, columns):
+        sides[i > 0].append(_agent_tokens(_Link(ego, view, ()), *column))
     none = AgentTokens(0, shared.features[:0].detach(), xy[:0], selection_mask=out.mask[:0])
     own, sent = (to_ego_frame([none, *parts], shared.grid, len(samples)) for parts in sides)
     origin, edge = (shared.grid.x_min, shared.grid.y_min), WINDOW_CELLS * shared.grid.cell_size_m

@@ -3,12 +3,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, count
 
 import torch
 from torch import Tensor
 
 from manyeyes.datatypes import Boxes, Sites
+
+ROUNDS_BETWEEN_CHECKS = 3
 
 
 @dataclass(frozen=True)
@@ -45,64 +49,106 @@ class Targets:
     positive: Tensor
 
 
-def assign_targets(sites: Sites, truth: list[Boxes], config: TargetConfig) -> Targets:
+@dataclass(frozen=True, eq=False)
+class BoxBatch:
+    """Ground truth of the B grids of a batch, on one device.
+
+    Attributes:
+        boxes: the M boxes of all grids, one grid after another, float32.
+        places: (B, K, 6) float32, of at most K boxes of each grid: x, y, cosine and sine of the yaw, half length, half width.
+        row: (B, K) int64, their rows of boxes; -1 where a grid has fewer than K.
+    """
+
+    boxes: Boxes
+    places: Tensor
+    row: Tensor
+
+    @classmethod
+    def of(cls, truth: Sequence[Boxes], device: torch.device) -> BoxBatch:
+        """Batch the boxes of every grid, which are on the CPU, and move them to a device."""
+        boxes = Boxes.cat(list(truth)).to(torch.float32)
+        counts, width = [len(part) for part in truth], max(map(len, truth), default=0)
+        at = torch.arange(width, device="cpu")
+        first = torch.tensor([0, *accumulate(counts)][:-1], dtype=torch.int64, device="cpu")
+        exists = at < torch.tensor(counts, dtype=torch.int64, device="cpu")[:, None]
+        row = torch.where(exists, first[:, None] + at, -1)
+        columns = (boxes.center[:, :2], boxes.yaw.cos()[:, None], boxes.yaw.sin()[:, None], boxes.size[:, :2] / 2)
+        places = torch.cat((torch.cat(columns, 1), boxes.center.new_zeros(1, 6)))[row]
+        return cls(boxes.to(device=device), places.to(device), row.to(device))
+
+    def near(self, sites: Sites) -> tuple[Tensor, Tensor]:
+        """Return for N sites the places (6, N, K) of the boxes of their grid, and their rows (N, K)."""
+        batch = sites.batch
+        found = self.places.flatten(1).index_select(0, batch).view(len(sites), self.row.shape[1], 6)
+        return found.permute(2, 0, 1), self.row.index_select(0, batch)
+
+
+def assign_targets(sites: Sites, truth: Sequence[Boxes] | BoxBatch, config: TargetConfig) -> Targets:
     """Assign ground truth boxes to sites: the nearest site of a box is its centre; no site serves two boxes.
 
     Pairs are taken in ascending order of distance (ties by site, then box), so that a box whose nearest site is taken
     gets the next. A box
-    without site within assign_radius_m has no centre.
+    without site within assign_radius_m has no centre. truth: of every grid of the batch.
     """
-    n, batch, xy = len(sites), sites.batch, sites.xy
-    heat, weight = torch.zeros(n), torch.zeros(n)
-    box = torch.full((n,), -1, dtype=torch.int64)
-    positive, first = torch.zeros(n, dtype=torch.bool), 0
-    for b, boxes in enumerate(truth):
-        rows = (batch == b).nonzero()[:, 0]
-        if len(rows) and len(boxes):
-            distance = torch.cdist(xy[rows], boxes.center[:, :2].float())
-            nearest, which = distance.min(1)
-            near = nearest < config.assign_radius_m
-            heat[rows] = torch.exp(-(nearest**2) / (2 * config.heat_sigma_m**2)).clamp_max(0.99)
-            box[rows[near]] = which[near] + first
-            weight[rows[near]] = torch.exp(-(nearest[near] ** 2) / (2 * config.shape_sigma_m**2))
-            for site, target in _unique_pairs(distance, config.assign_radius_m):
-                heat[rows[site]], weight[rows[site]], positive[rows[site]] = 1.0, 1.0, True
-                box[rows[site]] = first + target
-        first += len(boxes)
-    return Targets(heat, box, weight, Boxes.cat(truth), positive)
+    batch = truth if isinstance(truth, BoxBatch) else BoxBatch.of(truth, sites.key.device)
+    places, row = batch.near(sites)
+    xy = sites.xy
+    if not row.numel():
+        none = xy.new_zeros(len(sites))
+        return Targets(none, torch.full_like(sites.key, -1), none, batch.boxes, none > 0)
+    dx, dy = xy[:, :1] - places[0], xy[:, 1:] - places[1]
+    distance = torch.where(row >= 0, (dx * dx + dy * dy).sqrt(), torch.inf)
+    nearest, which = distance.min(1)
+    near = nearest < config.assign_radius_m
+    heat = torch.exp(-(nearest**2) / (2 * config.heat_sigma_m**2)).clamp_max(0.99)
+    box = torch.where(near, row.gather(1, which[:, None])[:, 0], -1)
+    weight = torch.where(near, torch.exp(-(nearest**2) / (2 * config.shape_sigma_m**2)), 0.0)
+    site, column = (distance < config.assign_radius_m).nonzero().unbind(1)
+    target, order = row[site, column], distance[site, column].sort(stable=True).indices
+    centre = match_pairs(site[order], target[order], len(sites), len(batch.boxes))
+    positive = centre >= 0
+    box = torch.where(positive, centre, box)
+    return Targets(heat.masked_fill(positive, 1.0), box, weight.masked_fill(positive, 1.0), batch.boxes, positive)
 
 
-def _unique_pairs(distance: Tensor, max_distance_m: float) -> list[tuple[int, int]]:
-    site, target = (distance < max_distance_m).nonzero(as_tuple=True)
-    order = distance[site, target].sort(stable=True).indices
-    taken_sites: set[int] = set()
-    taken_boxes: set[int] = set()
-    pairs = []
-    for s, t in zip(site[order].tolist(), target[order].tolist()):
-        if s not in taken_sites and t not in taken_boxes:
-            taken_sites.add(s)
-            taken_boxes.add(t)
-            pairs.append((s, t))
-    return pairs
+def match_pairs(site: Tensor, box: Tensor, num_sites: int, num_boxes: int) -> Tensor:
+    """Match sites (P,) and boxes (P,), pairs in descending priority; returns the box (num_sites,) of each site, -1 for none.
+
+    Greedy matching takes a pair if neither side is taken by an earlier one. Here every round takes all pairs that come
+    first on both sides, which the greedy rule takes too; a few rounds leave none.
+    """
+    place = torch.arange(len(site), device=site.device)
+    found = site.new_full((num_sites,), -1)
+    taken = site.new_zeros(num_boxes)
+    free, last = torch.ones_like(site, dtype=torch.bool), len(site)
+    for number in count():
+        # A pair that is not free counts as one after the last.
+        priority = torch.where(free, place, last)
+        first_of_site = site.new_full((num_sites,), last).scatter_reduce_(0, site, priority, "amin")
+        first_of_box = site.new_full((num_boxes,), last).scatter_reduce_(0, box, priority, "amin")
+        is_first = free & (first_of_site[site] == place) & (first_of_box[box] == place)
+        found = found.scatter_reduce(0, site, torch.where(is_first, box, -1), "amax")
+        taken = taken.index_add(0, box, is_first.long())
+        free = free & (found[site] < 0) & (taken[box] == 0)
+        # Asking whether pairs are left makes the host wait.
+        if number % ROUNDS_BETWEEN_CHECKS == ROUNDS_BETWEEN_CHECKS - 1 and not bool(free.any()):
+            return found
+    raise AssertionError("every round takes the first free pair")
 
 
-def find_nearby_objects(sites: Sites, truth: list[Boxes], config: TargetConfig) -> Tensor:
+def find_nearby_objects(sites: Sites, truth: Sequence[Boxes] | BoxBatch, config: TargetConfig) -> Tensor:
     """Return the box (N,) int64, a row over all grids, that contains a cell's centre, -1 for none.
 
     Boxes are enlarged by max(prune_margin_m, half a cell) on every side; of several, the nearest centre wins.
     """
+    batch = truth if isinstance(truth, BoxBatch) else BoxBatch.of(truth, sites.key.device)
     margin = max(config.prune_margin_m, sites.grid.cell_size_m / 2)
-    batch, xy = sites.batch, sites.xy
-    near, first = torch.full((len(sites),), -1, dtype=torch.int64), 0
-    for b, boxes in enumerate(truth):
-        rows = (batch == b).nonzero()[:, 0]
-        if len(rows) and len(boxes):
-            delta = xy[rows][:, None] - boxes.center[None, :, :2].float()
-            c, s = boxes.yaw.float().cos(), boxes.yaw.float().sin()
-            longitudinal, lateral = delta[..., 0] * c + delta[..., 1] * s, delta[..., 1] * c - delta[..., 0] * s
-            half = boxes.size[:, :2].float() / 2 + margin
-            inside = (longitudinal.abs() <= half[:, 0]) & (lateral.abs() <= half[:, 1])
-            distance, which = torch.where(inside, delta.norm(dim=2), torch.inf).min(1)
-            near[rows] = torch.where(distance < torch.inf, which + first, -1)
-        first += len(boxes)
-    return near
+    (x, y, cosine, sine, half_length, half_width), row = batch.near(sites)
+    if not row.numel():
+        return torch.full_like(sites.key, -1)
+    xy = sites.xy
+    dx, dy = xy[:, :1] - x, xy[:, 1:] - y
+    inside = ((dx * cosine + dy * sine).abs() <= half_length + margin) & (row >= 0)
+    inside &= (dy * cosine - dx * sine).abs() <= half_width + margin
+    distance, which = torch.where(inside, dx * dx + dy * dy, torch.inf).min(1)
+    return torch.where(distance < torch.inf, row.gather(1, which[:, None])[:, 0], -1)

@@ -71,8 +71,8 @@ def dilate_observed(seen: Tensor, tile: BevGrid) -> Tensor:
 def make_line_field_target(truth: MapElements, tile: BevGrid, kinds: Sequence[str]) -> LineFieldTarget:
     """Make the target of the elements of these kinds, in the tile's frame, metres."""
     rows, columns = tile.shape
-    ink = torch.zeros(len(kinds), rows, columns)
-    foot, way = (torch.zeros(len(kinds), 2, rows, columns) for _ in range(2))
+    ink = torch.zeros(len(kinds), rows, columns, device="cpu")
+    foot, way = (torch.zeros(len(kinds), 2, rows, columns, device="cpu") for _ in range(2))
     end, half = torch.zeros_like(ink), torch.zeros_like(ink)
     for layer, kind in enumerate(kinds):
         own = np.flatnonzero(truth.kind == KINDS.index(kind))

@@ -98,7 +98,7 @@ def match_queries(logit: Tensor, point: Tensor, target: MapTarget, config: MapLo
     """
     elements, orders = target.orders.shape[:2]
     if elements == 0:
-        empty = torch.zeros(0, dtype=torch.int64)
+        empty = torch.zeros(0, dtype=torch.int64, device=point.device)
         return QueryMatch(empty, empty, target.orders.new_zeros(0, *point.shape[1:]))
     with torch.no_grad():
         distance = torch.cdist(point.flatten(1), target.orders.flatten(0, 1).flatten(1), p=1).view(-1, elements, orders)

@@ -187,7 +187,7 @@ class TileStream:
 def rasterise_elements(elements: MapElements, grid: BevGrid, kinds: Sequence[str]) -> Tensor:
     """Rasterise elements in the grid's frame to (kinds, rows, columns) bool; crossings are filled."""
     rows, columns = grid.shape
-    out = torch.zeros(len(kinds), rows, columns, dtype=torch.bool)
+    out = torch.zeros(len(kinds), rows, columns, dtype=torch.bool, device="cpu")
     for layer, kind in enumerate(kinds):
         own = elements.take(elements.kind == KINDS.index(kind))
         if len(own):
@@ -226,7 +226,7 @@ def _mirrored_image(image: CameraImage) -> CameraImage:
     """Return the image of the mirrored camera in the mirrored world: columns swapped, right-handed axes."""
     camera, pose = image.camera, image.camera.agent_from_camera
     # Mirrored in the agent's y and in the camera's x: two mirrors are a rotation.
-    rotation = _MIRROR[:, None] * pose.rotation * torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
+    rotation = _MIRROR[:, None] * pose.rotation * pose.rotation.new_tensor([-1.0, 1.0, 1.0])
     intrinsic = camera.intrinsic.clone()
     intrinsic[0, 2] = camera.width - intrinsic[0, 2]
     placed = Camera(intrinsic, Transform(rotation, pose.translation * _MIRROR), camera.width, camera.height)

@@ -78,13 +78,13 @@ def novel_fraction(drawn: MapElements, truth: MapElements) -> NDArray[np.float64
 
 def fit_platt(logit: Tensor, fraction: Tensor) -> tuple[float, float]:
     """Fit scale and shift of logits (N,) by cross entropy against fractions (N,), regularised towards the identity."""
-    start = torch.tensor([1.0, 0.0], dtype=torch.float64)
+    start = torch.tensor([1.0, 0.0], dtype=torch.float64, device="cpu")
     x = torch.stack((logit.double(), torch.ones_like(logit, dtype=torch.float64)), 1)
     line = start.clone()
     for _ in range(50):
         p = (x @ line).sigmoid()
         gradient = x.T @ (p - fraction) + PRIOR_WEIGHT * (line - start)
-        hessian = (x * (p * (1 - p))[:, None]).T @ x + PRIOR_WEIGHT * torch.eye(2, dtype=torch.float64)
+        hessian = (x * (p * (1 - p))[:, None]).T @ x + PRIOR_WEIGHT * torch.eye(2, dtype=torch.float64, device="cpu")
         line = line - torch.linalg.solve(hessian, gradient).clamp(-1.0, 1.0)
     return max(MIN_SLOPE, float(line[0])), float(line[1])
 

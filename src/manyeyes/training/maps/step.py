@@ -31,7 +31,8 @@ def warp_tokens(model: MapModel, tokens: SparseBev, samples: Sequence[MapSample]
     """Warp the tokens of all frames to the tiles of all samples; returns the arguments of ``MapModel.fuse_features``."""
     poses = [sample.tile_from_agent for sample in samples]
     motion = Transform(torch.cat([p.rotation for p in poses]), torch.cat([p.translation for p in poses]))
-    tile = torch.repeat_interleave(torch.arange(len(samples)), torch.tensor([len(s.frames) for s in samples]))
+    tiles = [tile for tile, sample in enumerate(samples) for _ in sample.frames]
+    tile = torch.tensor(tiles, dtype=torch.int64, device=tokens.features.device)
     return model.warp_tokens(tokens, motion, tile, len(samples))
 
 
@@ -42,7 +43,7 @@ def subsample_tokens(tokens: SparseBev, score: Tensor, drop_fraction: Tensor) ->
     order = order[batch[order].argsort(stable=True)]
     count = torch.bincount(batch, minlength=tokens.sites.batch_size)
     rank = torch.empty_like(order)
-    rank[order] = torch.arange(len(order)) - (count.cumsum(0) - count)[batch[order]]
+    rank[order] = torch.arange(len(order), device=order.device) - (count.cumsum(0) - count)[batch[order]]
     return tokens.keep(rank >= (drop_fraction * count).floor()[batch])
 
 

@@ -58,8 +58,8 @@ def make_map_target(truth: MapElements, tile: BevGrid, kinds: Sequence[str], poi
             kind.append(list(kinds).index(name))
             ring.append(is_ring(name))
     places = torch.from_numpy(np.array(shares).reshape(-1, points, 2)).float()
-    rings = torch.tensor(ring, dtype=torch.bool)
-    return MapTarget(torch.tensor(kind, dtype=torch.int64), rings, enumerate_orders(places, rings))
+    rings = torch.tensor(ring, dtype=torch.bool, device="cpu")
+    return MapTarget(torch.tensor(kind, dtype=torch.int64, device="cpu"), rings, enumerate_orders(places, rings))
 
 
 def select_observed(truth: MapElements, seen: Tensor, tile: BevGrid) -> MapElements:
@@ -89,7 +89,7 @@ def resample_evenly(line: NDArray[np.float64], points: int, ring: bool) -> NDArr
 def enumerate_orders(points: Tensor, ring: Tensor) -> Tensor:
     """Enumerate the equivalent orders of points (G, P, 2): (G, 2 P, P, 2); see MapTarget."""
     count = points.shape[1]
-    place = torch.arange(count)
+    place = torch.arange(count, device=points.device)
     shifts = (place[:, None] + place) % count
     shifts = torch.cat((shifts, shifts.flip(1)))
     ways = torch.stack((place, place.flip(0))).repeat(count, 1)

@@ -113,8 +113,8 @@ def match_ground_truth(
 ) -> GroundTruthMatches:
     """Return the ground truth matches, padded to the longest list on either side."""
     shape = len(a), max(map(len, a)), max(map(len, b))
-    pairs = torch.zeros(shape, dtype=torch.bool)
-    unmatched_a, unmatched_b = torch.zeros(shape[:2], dtype=torch.bool), torch.zeros(shape[::2], dtype=torch.bool)
+    pairs = torch.zeros(shape, dtype=torch.bool, device="cpu")
+    unmatched_a, unmatched_b = (torch.zeros(s, dtype=torch.bool, device="cpu") for s in (shape[:2], shape[::2]))
     for i, (ego, other, motion) in enumerate(zip(a, b, a_from_b)):
         n, m = len(ego), len(other)
         unmatched_a[i, :n], unmatched_b[i, :m] = True, True
@@ -122,7 +122,7 @@ def match_ground_truth(
             moved = motion.apply(other.boxes.center.double())[:, :2]
             away = torch.cdist(ego.xy.double(), moved)
             nearest, back = away.argmin(1), away.argmin(0)
-            rows = (back[nearest] == torch.arange(n)) & (away.amin(1) < match_radius_m)
+            rows = (back[nearest] == torch.arange(n, device=back.device)) & (away.amin(1) < match_radius_m)
             pairs[i, rows.nonzero()[:, 0], nearest[rows]] = True
             unmatched_a[i, :n], unmatched_b[i, :m] = (
                 away.amin(1) > unmatched_radius_m,
@@ -181,7 +181,9 @@ class FeakmTask(Task[FeakmTrainConfig, FeakmNet, ViewPair]):
         ego, other = (self._perturb(side, name, numbers.start) for side, name in ((ego, "ego"), (other, "other")))
         layers = model.matcher(KeypointBatch.of(ego), KeypointBatch.of(other))
         measures = matching_recall_precision(layers[-1], truth, config.net.matcher.min_match_prob)
-        return matching_loss(layers, truth), dict(zip(self.shown_terms, torch.tensor(measures, dtype=torch.float64)))
+        return matching_loss(layers, truth), dict(
+            zip(self.shown_terms, torch.tensor(measures, dtype=torch.float64, device="cpu"))
+        )
 
     def _keypoints(
         self, model: FeakmNet, pairs: Sequence[ViewPair], first: int
