@@ -24,7 +24,7 @@ export OMP_NUM_THREADS ?= 1
 help:
 	@echo "make demo          simulate a drive, evaluate the methods on it: table, figures, report in $(OUT)"
 	@echo "make test-fast     tests without training and without slow ones, in two minutes; 20 hypothesis examples each"
-	@echo "make test          every test; 200 hypothesis examples each"
+	@echo "make test          every test, in two processes; 200 hypothesis examples each"
 	@echo "make test-nightly  every test; 2,000 hypothesis examples each, other ones in every run"
 	@echo "make probes        hostile packets, kills, races and the like at full length, in hours"
 	@echo "make coverage      every test, and the fraction of statements that they run, by module"
@@ -49,7 +49,7 @@ demo: $(STAMP)
 	@$(BIN)/manyeyes demo --out $(OUT)
 
 test: $(STAMP)
-	@$(BIN)/python -m pytest
+	@$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-fast: $(STAMP)
 	@HYPOTHESIS_PROFILE=fast $(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not training"
