@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 import hashlib
 import json
+import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import torch
+import yaml
 
 pytest.importorskip("libsumo", reason="scenarios need the sim extra")
 
@@ -25,7 +28,15 @@ pytestmark = pytest.mark.slow
 
 
 SPEC = ScenarioSpec(
-    "generated-1", 7, "one", vehicles=1, frames=2, history_frames=1, roadside_chance=1.0, min_vehicles=6
+    "generated-1",
+    7,
+    "one",
+    vehicles=1,
+    frames=2,
+    history_frames=1,
+    roadside_chance=1.0,
+    min_vehicles=6,
+    intensity="material",
 )
 JOBS = [
     Job("train", SPEC),
@@ -106,6 +117,40 @@ def test_finished_scenarios_are_kept_and_half_written_ones_redone(made: Path) ->
     record(JOBS, made, workers=1)
     assert files(made) == before
     assert (made / "train" / "one" / "scenario.json").stat().st_mtime_ns == kept
+
+
+def test_recordings_from_before_intensity_laws_are_continued(made: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(made, tmp_path / "old"))
+    for path in root.glob("*/*/scenario.json"):
+        content = json.loads(path.read_text())
+        del content["spec"]["intensity"], content["spec"]["sensor_mix"]
+        path.write_text(json.dumps(content))
+    before = (root / "train" / "one" / "scenario.json").stat().st_mtime_ns
+    record(JOBS, root)
+    assert (root / "train" / "one" / "scenario.json").stat().st_mtime_ns == before
+    with pytest.raises(ConfigError, match="intensity"):
+        record([replace(job, spec=replace(job.spec, intensity="carla")) for job in JOBS], root)
+
+
+def test_mixed_sensors_are_read_back_with_tilt_height_and_exact_intensity(tmp_path: Path) -> None:
+    spec = replace(SPEC, sensor_mix="all", rate_hz=20.0)
+    record([Job("train", spec)], tmp_path)
+    scenario = make_scenario(spec, load_town("generated-1"))
+    true = scenario.snapshot(1)
+    read = Opv2vRecording(tmp_path, "train", strict=True, use_cache=False).snapshot("one", 1)
+    protocol = yaml.safe_load((tmp_path / "train" / "one" / "data_protocol.yaml").read_text())
+    for one, two in zip(read.frames, true.frames, strict=True):
+        torch.testing.assert_close(one.world_from_agent.matrix(), two.world_from_agent.matrix(), atol=1e-9, rtol=0)
+        torch.testing.assert_close(one.points.xyz, two.points.xyz, atol=1e-4, rtol=0)
+        assert torch.equal(one.points.intensity, two.points.intensity)
+        assert one.sensor_height_m == pytest.approx(two.sensor_height_m, abs=1e-6)
+        assert one.timestamp_ns == two.timestamp_ns == 50_000_000
+        lidar = scenario.lidar(one.agent_id)
+        assert protocol["lidar"][str(one.agent_id)] == lidar.describe()
+        tilt = math.degrees(float(one.world_from_agent.rotation[2, 2].clamp(max=1).acos()))
+        if one.is_infrastructure:
+            assert tilt == pytest.approx(math.degrees(math.hypot(lidar.roll_rad, lidar.pitch_rad)), abs=0.01)
+            assert 4.0 <= one.sensor_height_m <= 7.0
 
 
 def test_misuse_is_named(tmp_path: Path) -> None:

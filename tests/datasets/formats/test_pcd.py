@@ -12,7 +12,7 @@ import torch
 
 from manyeyes.datasets.formats.cache import ArrayCache
 from manyeyes.datasets.formats.lzf import lzf_decompress
-from manyeyes.datasets.formats.pcd import read_pcd, read_table, write_pcd
+from manyeyes.datasets.formats.pcd import read_pcd, read_table, write_float_pcd, write_pcd
 from manyeyes.datatypes import RecordingError
 
 OPV2V_HEADER = """# .PCD v0.7 - Point Cloud Data file format
@@ -144,6 +144,14 @@ def test_float_intensity_is_kept_unless_it_reaches_255(tmp_path: Path) -> None:
         text = OPV2V_HEADER.format(n=3, data="ascii").replace("rgb", "intensity")
         (tmp_path / "a.pcd").write_text(text + "".join(f"0 0 0 {v * top}\n" for v in (0, 0.5, 1)))
         assert read_pcd(tmp_path / "a.pcd").intensity.tolist() == pytest.approx(wanted)
+
+
+def test_written_float_intensity_is_exact(tmp_path: Path) -> None:
+    xyz, intensity = np.arange(12, dtype=np.float32).reshape(4, 3), np.float32([0, 0.1234567, 1, 1.5])
+    write_float_pcd(tmp_path / "a.pcd", xyz, intensity)
+    cloud = read_pcd(tmp_path / "a.pcd")
+    assert np.array_equal(cloud.xyz, xyz)
+    assert np.array_equal(cloud.intensity, intensity.clip(0, 1))
 
 
 def test_compressed_clouds_of_dair(tmp_path: Path) -> None:
