@@ -3,6 +3,7 @@
 
 import hashlib
 import json
+import math
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -99,6 +100,18 @@ def test_the_simulators_ground_truth_round_trips(made: Path) -> None:
     assert torch.equal(read.truth.boxes.label, true.boxes.label[either])
     torch.testing.assert_close(read.truth.boxes.corners(), true.boxes[either].corners(), atol=1e-9, rtol=0)
     assert torch.equal(read.truth.seen, torch.stack([true.seen[0], by_pole])[:, either])
+
+
+def test_a_tilted_sensor_is_read_back_as_such(tmp_path: Path) -> None:
+    spec = replace(SPEC, lidar="dair-pandar40p", frames=1)
+    dair.record_dair([Job("train", spec)], tmp_path)
+    read = DairRecording(tmp_path, strict=True).snapshot("0", 0)
+    scenario = dair.make_first_scenario(replace(spec, frames=5, rate_hz=50.0), None, roadside=True)
+    true = scenario.snapshot(4).frames[0]
+    pose = read.frames[0].world_from_agent
+    torch.testing.assert_close(pose.matrix(), true.world_from_agent.matrix(), atol=1e-9, rtol=0)
+    assert math.degrees(math.atan2(-float(pose.rotation[2, 0]), float(pose.rotation[2, 2]))) == pytest.approx(0.78)
+    torch.testing.assert_close(read.frames[0].points.xyz, true.points.xyz, atol=1e-4, rtol=0)
 
 
 def test_a_mirrored_or_transposed_reader_shows(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:

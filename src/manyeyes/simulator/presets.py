@@ -201,6 +201,8 @@ SIMULATION_PRESETS: dict[str, SimulationPreset] = {
         intensity="material",
     ),
     "dair-crossing": _CROSSING,
+    # The vehicle's sensor as DAIR-V2X has it: denser at the horizon, and tilted.
+    "dair-crossing-tilted": replace(_CROSSING, lidar="dair-pandar40p"),
     "smoke-dair": replace(_CROSSING, splits=_SMOKE_SPLITS, frames=3, min_vehicles=4),
     "carla-sensors-small": _SENSORS,
     "carla-beams-16": _one_sensor("beams-16"),
