@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from manyeyes.datasets.base import RecordingReader, require_index
+from manyeyes.datasets.lidar_frame import rotation_of_quaternion
 from manyeyes.datasets.registry import register_dataset
 from manyeyes.datatypes import (
     LABELS,
@@ -150,7 +151,7 @@ class Argoverse2Recording(RecordingReader):
         )
         here = time == timestamp_ns
         values = torch.from_numpy(np.stack([c[here] for c in self._table(path, names)], -1).astype(np.float64))
-        rotation = _rotation(values[:, 6:])
+        rotation = rotation_of_quaternion(values[:, 6:])
         labels = dict(_LABEL_OF_CATEGORY)
         found = tuple(str(c) for c in category[here])
         return Annotations(
@@ -190,7 +191,7 @@ class Argoverse2Recording(RecordingReader):
             path = self._folders[scenario] / _POSES
             raise RecordingError(f"{path}: no pose at the sweep's time {timestamp_ns}; {_REMEDY}.")
         values = torch.tensor([float(p[row[0]]) for p in parts], dtype=torch.float64)
-        return Transform(_rotation(values[:4]), values[4:])
+        return Transform(rotation_of_quaternion(values[:4]), values[4:])
 
     def _speed(self, scenario: str, timestamp_ns: int) -> float:
         """Return metres per second between the poses 50 ms before and after, or as near as the log goes."""
@@ -223,17 +224,6 @@ class Argoverse2Recording(RecordingReader):
 
 def _list_folders(folder: Path) -> list[Path]:
     return sorted(p for p in folder.iterdir() if p.is_dir() and not p.name.startswith("."))
-
-
-def _rotation(quaternion: Tensor) -> Tensor:
-    """Return rotation matrices (..., 3, 3) of unit quaternions (..., 4) as w, x, y, z."""
-    w, x, y, z = (quaternion / quaternion.norm(dim=-1, keepdim=True)).unbind(-1)
-    rows = (
-        torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)), -1),
-        torch.stack((2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)), -1),
-        torch.stack((2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)), -1),
-    )
-    return torch.stack(rows, -2)
 
 
 def _columns(path: Path, names: tuple[str, ...]) -> tuple[np.ndarray, ...]:

@@ -16,7 +16,7 @@ import yaml
 from manyeyes.datasets.base import count_points_in_listed_boxes
 from manyeyes.datasets.formats.pcd import PcdTable, write_table
 from manyeyes.datasets.opv2v import Opv2vRecording
-from manyeyes.datasets.opv2v.dialect import OPV2V, V2V4REAL, V2X_REAL, find_label, pose_of_matrix
+from manyeyes.datasets.opv2v.dialect import OPV2V, V2V4REAL, V2X_REAL, pose_of_matrix
 from manyeyes.datasets.registry import open_recording
 from manyeyes.datatypes import LABELS, RecordingError
 
@@ -243,16 +243,3 @@ def test_a_matrix_that_is_no_pose_is_refused(tmp_path: Path, value: Any, text: s
     with pytest.raises(RecordingError, match=text) as caught:
         Opv2vRecording(tmp_path / "a").snapshot("a", 0)
     assert "lidar_pose" in str(caught.value) and "000003.yaml" in str(caught.value)
-
-
-def test_types_of_real_recordings() -> None:
-    labels = {name: find_label(name) for name in ("Car", "ScooterRider", "BicycleRider", "RoadWorker", "LongVehicle")}
-    found = {name: None if label is None else LABELS[label] for name, label in labels.items()}
-    assert found == {
-        "Car": "car",
-        "ScooterRider": "motorcyclist",
-        "BicycleRider": "cyclist",
-        "RoadWorker": "pedestrian",
-        "LongVehicle": "van",
-    }
-    assert find_label("TrashCan") is None and find_label("Cone") is None

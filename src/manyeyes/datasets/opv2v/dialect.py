@@ -21,27 +21,11 @@ import numpy as np
 import torch
 
 from manyeyes.datasets.opv2v.carla import transform_from_carla
-from manyeyes.datatypes import LABELS, Transform
+from manyeyes.datatypes import Transform
 
 V2V4REAL_AGENTS = frozenset({"0", "1"})
 V2X_REAL_AGENTS = frozenset({"-2", "-1", "1", "2"})
 _V2V4REAL_NAME, _V2X_REAL_NAME = "CAV_data", re.compile(r"\d{4}-\d{2}-\d{2}-\d{2}-\d{2}-\d{2}(_.*)?")
-
-_TYPES = {
-    "car": ("car", "policecar", "tourcar"),
-    "van": ("van", "longvehicle", "ambulance"),
-    "truck": (
-        "truck", "concretetruck", "excavator", "crane", "forklift", "roadroller", "bulldozer", "trailer",
-    ),
-    "bus": ("bus", "tram"),
-    "pedestrian": ("pedestrian", "person", "roadworker", "child"),
-    "cyclist": ("cyclist", "bicyclerider", "bicycle", "tricyclist"),
-    "motorcyclist": (
-        "motorcyclist", "motorcyclerider", "motorcylerider", "motorcycle", "scooterrider", "scooter", "trimotorcycle",
-        "freighttricycle",
-    ),
-}  # fmt: skip
-_LABEL_OF_TYPE = {name: LABELS.index(label) for label, names in _TYPES.items() for name in names}
 
 
 class Traits(Protocol):
@@ -88,11 +72,6 @@ class Dialect:
 OPV2V = Dialect("OPV2V")
 V2V4REAL = Dialect("V2V4Real", is_right_handed=True, are_boxes_local=True, delta_s=0.1)
 V2X_REAL = Dialect("V2X-Real", is_right_handed=True, delta_s=0.1)
-
-
-def find_label(stated_type: str) -> int | None:
-    """Return the index into LABELS of a type that a file states; None of another object."""
-    return _LABEL_OF_TYPE.get(stated_type.lower())
 
 
 def pose_of_matrix(matrix: np.ndarray) -> tuple[float, ...]:

@@ -14,7 +14,8 @@ import yaml
 from manyeyes._io import atomic_write_text
 from manyeyes.datasets.formats.cache import ArrayCache
 from manyeyes.datasets.formats.yaml_file import REMEDY as _REMEDY, load_yaml
-from manyeyes.datasets.opv2v.dialect import find_label, pose_of_matrix
+from manyeyes.datasets.object_types import find_label
+from manyeyes.datasets.opv2v.dialect import pose_of_matrix
 from manyeyes.datatypes import LABELS, RecordingError
 from manyeyes.datatypes.errors import shorten
 
