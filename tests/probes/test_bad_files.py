@@ -19,8 +19,9 @@ import torch
 from safetensors.torch import save_file
 
 from manyeyes._io import MAX_TEXT_BYTES, read_file
-from manyeyes.datasets.dair_v2x.json_files import load_json, read_calibration
+from manyeyes.datasets.dair_v2x.json_files import read_calibration
 from manyeyes.datasets.formats.image_io import read_image
+from manyeyes.datasets.formats.json_file import load_json
 from manyeyes.datasets.formats.pcd import read_pcd
 from manyeyes.datasets.opv2v.metadata import load_yaml, read_protocol, read_record
 from manyeyes.datatypes import ManyeyesError

@@ -48,7 +48,7 @@ def make_lidar_frame(
     return AgentFrame(
         agent_id=agent_id,
         timestamp_ns=timestamp_ns,
-        points=PointCloud.of(torch.from_numpy(xyz), torch.from_numpy(cloud.intensity[met]), time_s),
+        points=PointCloud.of(torch.from_numpy(xyz), torch.from_numpy(np.clip(cloud.intensity[met], 0, 1)), time_s),
         world_from_agent=world_from_lidar @ Transform.from_xyz_yaw(0, 0, -sensor_height_m),
         pose_covariance=torch.zeros(3, 3, dtype=torch.float64),
         sensor_height_m=sensor_height_m,

@@ -17,7 +17,7 @@ import torch
 from manyeyes.datasets.base import count_points_in_listed_boxes, iter_eval_frames
 from manyeyes.datasets.dair_v2x import DairOptions, DairRecording, json_files, reader
 from manyeyes.datasets.formats.pcd import PcdCloud, PcdTable, write_table
-from manyeyes.datatypes import ConfigError, RecordingError, Transform
+from manyeyes.datatypes import LABELS, ConfigError, RecordingError, Transform
 
 
 def rotation(yaw: float, pitch: float = 0.0, roll: float = 0.0) -> np.ndarray:
@@ -425,6 +425,31 @@ def test_v2x_seq_names_frames_and_corrects_in_the_vehicles_frame(root: Path) -> 
     place = recording.lidar_poses(recording.pair("12", 0))[1].translation
     # The correction is level in the vehicle's LiDAR frame, which is tilted by a hundredth.
     torch.testing.assert_close(place, torch.from_numpy(POLE[1]), atol=0.02, rtol=0)
+
+
+def test_people_are_kept_behind_the_vehicles_whose_ids_they_do_not_change(root: Path) -> None:
+    """V2X-Seq's ten types: four of vehicles, four of people, and two that are neither."""
+    before = DairRecording(root).snapshot("12", 0).truth
+    people = ("Pedestrian", "Cyclist", "Tricyclist", "Motorcyclist", "Barrowlist", "TrafficCone")
+    spots = {f"p{n}": (kind, (2690.0 + 3 * n, 1700.0), 0.4 * n, (1.8, 0.7, 1.6)) for n, kind in enumerate(people)}
+    VEHICLES.update(spots)
+    try:
+        path = root / "vehicle-side/label/lidar/000010.json"
+        edit(path, lambda rows: [*(side_label(n, LIDAR) for n in spots), *rows])
+    finally:
+        for name in spots:
+            del VEHICLES[name]
+    boxes = json_files.read_side_labels(path)
+    names = [LABELS[label] for label in boxes.label.tolist()]
+    assert names[-4:] == ["pedestrian", "cyclist", "cyclist", "motorcyclist"]
+    assert set(names[:-4]) <= {"car", "van", "truck", "bus"} and boxes.id.tolist()[:-4] == list(
+        range(1, len(names) - 3)
+    )
+    assert len(set(boxes.id.tolist())) == len(boxes) and len(boxes.of_classes()) == len(names) - 4
+    after = DairRecording(root).snapshot("12", 0).truth
+    assert before is not None and after is not None and torch.equal(before.boxes.center, after.boxes.center)
+    sides = DairRecording(root, options=DairOptions(labels="sides")).snapshot("12", 0).truth
+    assert sides is not None and len(sides.of_classes(("pedestrian", "cyclist")).boxes) == 4
 
 
 def test_a_partial_download_is_usable_and_reports_what_is_missing(root: Path) -> None:

@@ -9,12 +9,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from manyeyes.datasets.dair_v2x.json_files import REMEDY, get_number, get_offset, get_text, load_json, load_list
+from manyeyes.datasets.dair_v2x.json_files import get_offset
+from manyeyes.datasets.formats.json_file import REMEDY, get_number, get_text, load_json, load_list
 from manyeyes.datasets.missing import FileProblem
 from manyeyes.datatypes import ConfigError, RecordingError
 
 ARCHIVE = "cooperative-vehicle-infrastructure"
 SPLIT_FILE = "cooperative-split-data.json"
+_SEQUENCE_SPLIT_FILE = "cooperative-split-data-spd.json"
 # Number of pairs of the official cooperative split.
 OFFICIAL_PAIRS = {"train": 4813, "val": 1783, "test": 2688, "test_A": 851}
 SIDES = ("vehicle-side", "infrastructure-side")
@@ -319,7 +321,11 @@ class _MissingCounts:
 
 def read_split_ids(root: Path, split: str, split_file: Path | str | None) -> frozenset[str]:
     """Return ids of the vehicle's frames of a split: under ``cooperative_split`` of the official file, or a bare list of ids."""
-    places = (Path(split_file),) if split_file is not None else (root / SPLIT_FILE, root / f"{split}.json")
+    places = (
+        (Path(split_file),)
+        if split_file is not None
+        else tuple(root / name for name in (SPLIT_FILE, _SEQUENCE_SPLIT_FILE, f"{split}.json"))
+    )
     path = next((p for p in places if p.is_file()), None)
     if path is None:
         official = ", ".join(f"{name} {count}" for name, count in OFFICIAL_PAIRS.items())

@@ -1,108 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
 """Readers of DAIR-V2X's JSON files: numbers that may be strings, calibrations, labels of one side and of both.
 
-Lengths are metres and angles radians on disk. Vehicles are ``Car``, ``Van``, ``Truck`` and ``Bus``, in any case of
-letters; everything else is left out, and so is a box without size, as in the official reader.
+Lengths are metres and angles radians on disk. Vehicles are ``Car``, ``Van``, ``Truck`` and ``Bus``, in any case of letters; behind
+them come ``Pedestrian``, ``Cyclist``, ``Tricyclist`` (a cyclist here, as in the benchmark) and ``Motorcyclist``. Everything else is
+left out, and so is a box without size, as in the official reader.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from manyeyes._io import parse_json, read_file
-from manyeyes.datatypes import LABELS, Boxes, RecordingError, Transform
+from manyeyes.datasets.formats.json_file import (
+    REMEDY,
+    get_array,
+    get_field,
+    get_number,
+    get_text,
+    join_path,
+    load_json,
+    load_list,
+)
+from manyeyes.datasets.object_types import find_label
+from manyeyes.datatypes import VEHICLE_LABELS, Boxes, RecordingError, Transform
 from manyeyes.datatypes.errors import shorten
 
-REMEDY = "copy or download the file again"
 # Published calibrations are rounded; a mirrored or sheared one is farther off than this.
 _NOT_A_ROTATION = 0.02
-_MAX_DEPTH = 8
-
-
-def load_json(path: Path) -> Any:
-    """Return the content of a JSON file."""
-    try:
-        return parse_json(read_file(path))
-    except FileNotFoundError:
-        raise RecordingError(f"{path}: no such file, expected JSON; {REMEDY}.") from None
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read ({error.strerror}), expected JSON; {REMEDY}.") from None
-    except ValueError as error:
-        reason = " ".join(str(error).split())
-        raise RecordingError(f"{path}: expected JSON, found something else ({reason}); {REMEDY}.") from None
-
-
-def load_list(path: Path) -> list[Mapping[str, Any]]:
-    """Return the objects of a JSON file that holds a list of them."""
-    content = load_json(path)
-    if not isinstance(content, list) or not all(isinstance(entry, Mapping) for entry in content):
-        found = type(content).__name__ if not isinstance(content, list) else "other things in it"
-        raise RecordingError(f"{path}: expected a list of JSON objects, found {found}; {REMEDY}.")
-    return content
-
-
-def get_field(path: Path, content: Any, key: str, json_path: str = "") -> Any:
-    """Return the value of a key that has to be there."""
-    if not isinstance(content, Mapping) or key not in content:
-        raise RecordingError(f"{path}: expected the key '{_name(json_path, key)}', found none; {REMEDY}.")
-    return content[key]
-
-
-def get_text(path: Path, content: Any, key: str, json_path: str = "") -> str:
-    """Return a value that has to be a text with something in it."""
-    found = get_field(path, content, key, json_path)
-    if not isinstance(found, str) or not found:
-        raise RecordingError(f"{path}: expected a text at '{_name(json_path, key)}', found {shorten(found)}; {REMEDY}.")
-    return found
-
-
-def get_number(path: Path, content: Any, key: str, json_path: str = "", blank: float | None = None) -> float:
-    """Return a finite number, written as such or as a string; blank: what an empty string stands for, None: an error."""
-    found = get_field(path, content, key, json_path)
-    if found == "" and blank is not None:
-        return blank
-    value = _number(found)
-    if value is None:
-        raise RecordingError(
-            f"{path}: expected a number at '{_name(json_path, key)}', found {shorten(found)}; {REMEDY}."
-        )
-    return value
-
-
-def _name(json_path: str, key: str) -> str:
-    return f"{json_path}.{key}" if json_path else key
-
-
-def _number(found: object) -> float | None:
-    if isinstance(found, bool) or not isinstance(found, (int, float, str)):
-        return None
-    try:
-        value = float(found)
-    except (ValueError, OverflowError):
-        return None
-    return value if np.isfinite(value) else None
-
-
-def _array(path: Path, found: object, shape: tuple[int, ...], name: str) -> np.ndarray:
-    """Return an array of the shape, from nested lists of numbers or strings in any nesting of as many."""
-    values = _flat(found)
-    if values is None or len(values) != int(np.prod(shape)):
-        what = " x ".join(map(str, shape))
-        raise RecordingError(f"{path}: expected {what} finite numbers at '{name}', found {shorten(found)}; {REMEDY}.")
-    return np.asarray(values, np.float64).reshape(shape)
-
-
-def _flat(found: object, depth: int = 0) -> list[float] | None:
-    if isinstance(found, Sequence) and not isinstance(found, str) and depth < _MAX_DEPTH:
-        parts = [_flat(entry, depth + 1) for entry in found]
-        return None if any(part is None for part in parts) else [v for part in parts for v in part or ()]
-    value = _number(found)
-    return None if value is None else [value]
+# Ids of people, where a file does not track all that it lists.
+_FIRST_UNTRACKED_ID = 1_000_000_000
 
 
 def read_calibration(path: Path) -> Transform:
@@ -116,12 +46,14 @@ def read_calibration(path: Path) -> Transform:
 def _motion(path: Path, content: Any) -> Transform:
     inner = content.get("transform", content) if isinstance(content, Mapping) else content
     json_path = "transform" if inner is not content else ""
-    rotation = _array(path, get_field(path, inner, "rotation", json_path), (3, 3), _name(json_path, "rotation"))
-    translation = _array(path, get_field(path, inner, "translation", json_path), (3,), _name(json_path, "translation"))
+    rotation = get_array(path, get_field(path, inner, "rotation", json_path), (3, 3), join_path(json_path, "rotation"))
+    translation = get_array(
+        path, get_field(path, inner, "translation", json_path), (3,), join_path(json_path, "translation")
+    )
     left, scale, right = np.linalg.svd(rotation)
     if np.abs(scale - 1).max() > _NOT_A_ROTATION or np.linalg.det(rotation) < 0:
         raise RecordingError(
-            f"{path}: '{_name(json_path, 'rotation')}' is no rotation (singular values {np.round(scale, 3).tolist()}, "
+            f"{path}: '{join_path(json_path, 'rotation')}' is no rotation (singular values {np.round(scale, 3).tolist()}, "
             f"determinant {np.linalg.det(rotation):.3f}), expected an orthonormal, right-handed matrix; {REMEDY}."
         )
     return Transform(torch.from_numpy(left @ right), torch.from_numpy(translation))
@@ -145,7 +77,7 @@ def read_side_labels(path: Path) -> Boxes:
     """Return vehicles that one side lists, in its LiDAR's frame, float64: ``3d_location`` is the middle, ``rotation`` the yaw."""
     places: list[list[float]] = []
     kept: list[tuple[int, int]] = []
-    for row, entry, label in _vehicles(path):
+    for row, entry, label in _objects(path):
         size = _size(path, entry, row)
         if min(size) <= 0:
             continue
@@ -165,9 +97,9 @@ def read_world_labels(path: Path) -> Boxes:
     """
     corners: list[np.ndarray] = []
     kept: list[tuple[int, int]] = []
-    for row, entry, label in _vehicles(path):
+    for row, entry, label in _objects(path):
         where = f"[{row}].world_8_points"
-        found = _array(path, get_field(path, entry, "world_8_points", f"[{row}]"), (8, 3), where)
+        found = get_array(path, get_field(path, entry, "world_8_points", f"[{row}]"), (8, 3), where)
         if not np.ptp(found, axis=0).any():
             continue
         corners.append(found)
@@ -201,14 +133,11 @@ def _check_corners(path: Path, corners: np.ndarray, where: str) -> None:
         )
 
 
-def _vehicles(path: Path) -> list[tuple[int, Mapping[str, Any], int]]:
-    """Return row, entry and index into LABELS of every vehicle in a label file."""
-    found = []
-    for row, entry in enumerate(load_list(path)):
-        name = get_text(path, entry, "type", f"[{row}]").lower()
-        if name in LABELS:
-            found.append((row, entry, LABELS.index(name)))
-    return found
+def _objects(path: Path) -> list[tuple[int, Mapping[str, Any], int]]:
+    """Return row, entry and index into LABELS of every vehicle and person in a label file, vehicles first."""
+    rows = [(r, e, find_label(get_text(path, e, "type", f"[{r}]"))) for r, e in enumerate(load_list(path))]
+    found = [(row, entry, label) for row, entry, label in rows if label is not None]
+    return sorted(found, key=lambda one: one[2] >= len(VEHICLE_LABELS))
 
 
 def _size(path: Path, entry: Mapping[str, Any], row: int) -> list[float]:
@@ -229,9 +158,18 @@ def _track(path: Path, entry: Mapping[str, Any], row: int) -> int:
 
 
 def _boxes(center: torch.Tensor, size: torch.Tensor, yaw: torch.Tensor, kept: list[tuple[int, int]]) -> Boxes:
-    """Return ids: track_id + 1 where all have one and none has it twice, else rows from 1: id 0 is the ego's own body."""
-    tracks = [track for _, track in kept]
-    whole = min(tracks, default=0) >= 0 and len(set(tracks)) == len(tracks)
-    ids = [t + 1 for t in tracks] if whole else list(range(1, len(kept) + 1))
+    """Return ids: track_id + 1 where all have one and none has it twice, else rows from 1: id 0 is the ego's own body.
+
+    People, who stand behind the vehicles, change no vehicle's id.
+    """
+    vehicles = [track for label, track in kept if label < len(VEHICLE_LABELS)]
+    everyone = [track for _, track in kept]
+    others = everyone[len(vehicles) :]
+    ids = [t + 1 for t in vehicles] if _are_tracks(vehicles) else list(range(1, len(vehicles) + 1))
+    ids += [t + 1 for t in others] if _are_tracks(everyone) else [_FIRST_UNTRACKED_ID + n for n in range(len(others))]
     label = torch.tensor([label for label, _ in kept], dtype=torch.int64)
     return Boxes.of(center, size, yaw, label=label, id=torch.tensor(ids, dtype=torch.int64))
+
+
+def _are_tracks(tracks: list[int]) -> bool:
+    return min(tracks, default=0) >= 0 and len(set(tracks)) == len(tracks)
