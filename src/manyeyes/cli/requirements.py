@@ -106,6 +106,8 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
     "study bandwidth": (_MATPLOTLIB,),
     "study shared-bandwidth": (_MATPLOTLIB,),
     "study num-agents": (_MATPLOTLIB,),
+    "study sensors": (_MATPLOTLIB,),
+    "study strata": (),
     "study ablation": (_MATPLOTLIB,),
     "study qualitative": (_PILLOW,),
     "study pose-noise-ap": (_MATPLOTLIB,),

@@ -35,6 +35,11 @@ STUDIES = {
     "shared-bandwidth": Study(
         _DETECTION, "every agent as ego, one budget for the channel (Eq. 2)",
         "detection.shared_bandwidth", "SharedBandwidthOptions"),
+    "sensors": Study(
+        _DETECTION, "intensity laws, one or two sweeps, and tilt, on recordings of the same scenes",
+        "detection.sensors", "SensorsOptions"),
+    "strata": Study(
+        _DETECTION, "AP of each split of a data set, such as the sealed one", "detection.strata", "StrataOptions"),
     "num-agents": Study(_DETECTION, "one agent to five", "detection.num_agents", "EvaluationOptions"),
     "ablation": Study(
         _DETECTION, "variants of a training, side by side (Table III)", "detection.ablation", "AblationOptions"),

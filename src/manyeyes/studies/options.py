@@ -6,8 +6,9 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
-from manyeyes._bounds import ByteCount, OutputFolder, PositiveInt, Seed, TrialCount, WorkerCount
+from manyeyes._bounds import AngleDeg, ByteCount, OutputFolder, PositiveInt, Seed, TrialCount, WorkerCount
 from manyeyes.studies.replay_options import FileChecks, ReplayOptions
 
 
@@ -56,6 +57,28 @@ class RobustnessOptions(EvaluationOptions):
     """Perturbations by the names of the tables, such as "0.4 s" "30 % loss"; by default all."""
     checkpoints: tuple[str, ...] = ()
     """Baselines beside the methods, as name=weights.safetensors."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorsOptions(EvaluationOptions):
+    """Options of the study sensors."""
+
+    other_data: tuple[Path, ...] = ()
+    """Recordings of the same scenes with other sensors, such as carla-beams-32, in the same split; tables name them by folder."""
+    laws: tuple[str, ...] = ("material", "carla", "constant", "zero", "shuffled", "low-gain-8bit")
+    """Intensity laws, of recordings with material intensity; none: that of the recording alone."""
+    sweeps: tuple[Literal[1, 2], ...] = (2, 1)
+    """Numbers of sweeps that a detector is given."""
+    tilts_deg: tuple[AngleDeg, ...] = (0.0,)
+    """Tilts of all sensors, degrees, with each law and number of sweeps."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StrataOptions(EvaluationOptions):
+    """Options of the study strata."""
+
+    strata: tuple[str, ...] = ()
+    """Splits of the data set, which are reported apart; by default all folders with scenarios."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,8 +22,10 @@ from manyeyes.datatypes import Snapshot
 from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS, MethodResult, MetricAccumulator
 from manyeyes.evaluation.detection.average_precision import DetectionProtocol, get_protocol
 from manyeyes.evaluation.detection.recording_filters import CachedRecording, FrameStride, NearestAgents
+from manyeyes.evaluation.detection.sensor_change import NO_SENSOR_CHANGE, SensorChange
 from manyeyes.models import pretrained
 from manyeyes.models.detector.protocols import BoxDetector, check_detector
+from manyeyes.models.detector.single_sweep import with_single_sweep
 
 CONDITIONS_PER_GROUP = 8
 """Conditions that are played side by side: more of them see each sweep once, fewer of them are lost when a study is stopped."""
@@ -34,7 +36,7 @@ class BenchmarkConfig:
     """What is compared, and how it is evaluated. weights: a name, a path or a detector. protocol: by name, over its range.
 
     frame_stride: judge each so many-th frame. num_agents: the nearest so many, in scenarios that have them; None: all of all
-    scenarios.
+    scenarios. sensors: changes of all agents' sensors.
     """
 
     weights: str | BoxDetector = pretrained.DEFAULT_DETECTOR
@@ -44,6 +46,7 @@ class BenchmarkConfig:
     pose_noise: PoseNoise | None = None
     frame_stride: int = 1
     num_agents: int | None = None
+    sensors: SensorChange = NO_SENSOR_CHANGE
 
     def filter_recording(self, recording: Recording) -> Recording:
         """What is evaluated of a recording."""
@@ -80,11 +83,13 @@ def run_scenario(
 ) -> list[list[MetricAccumulator]]:
     """Return all methods of each configuration on one scenario; a function of its arguments alone.
 
-    The configurations have the same weights, view and history: each sweep is read and processed once for all of them.
+    The configurations have the same weights, sensors, view and history: each sweep is read and processed once for all of them.
     """
     torch.set_num_threads(1)
     first = configs[0]
     detector, feature_cache = load_detector(first.weights), {}
+    if first.sensors.sweeps == 1:
+        detector = with_single_sweep(detector)
     max_snapshots = 2 * first.frame_stride + first.replay.warmup_frames + 1
     recording = CachedRecording(first.filter_recording(open_recording()), max_snapshots)
     accumulators_by_config = [
@@ -102,13 +107,14 @@ def _iterate_snapshots(
     recording: Recording, scenario: str, detector: BoxDetector, config: BenchmarkConfig, feature_cache: CachedOutputs
 ) -> Iterator[tuple[int, Iterator[ReplayStep]]]:
     """Return the steps of one configuration, evaluated snapshot by evaluated snapshot."""
-    perturb = partial(_perturb, config.pose_noise)
+    perturb = partial(_perturb, config.pose_noise, config.sensors)
     steps = replay(recording, scenario, detector, config.methods, config.replay, perturb, feature_cache)
     return groupby(steps, lambda step: step.snapshot.index)
 
 
-def _perturb(noise: PoseNoise | None, snapshot: Snapshot) -> Snapshot:
-    return noise.apply(snapshot, 0) if noise else snapshot
+def _perturb(noise: PoseNoise | None, sensors: SensorChange, snapshot: Snapshot) -> Snapshot:
+    changed = sensors.apply(snapshot)
+    return noise.apply(changed, 0) if noise else changed
 
 
 def run_benchmarks(
@@ -138,7 +144,9 @@ def run_benchmarks(
 
 def _group_configs(configs: Sequence[BenchmarkConfig]) -> list[tuple[BenchmarkConfig, ...]]:
     """Return neighbours that can be replayed together, at most TOGETHER of them: what is finished is handed out group by group."""
-    comparable = groupby(configs, lambda c: (c.weights, c.frame_stride, c.num_agents, c.replay.warmup_frames))
+    comparable = groupby(
+        configs, lambda c: (c.weights, c.frame_stride, c.num_agents, c.replay.warmup_frames, c.sensors)
+    )
     runs = [tuple(run) for _, run in comparable]
     return [run[k : k + CONDITIONS_PER_GROUP] for run in runs for k in range(0, len(run), CONDITIONS_PER_GROUP)]
 
