@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
-from scipy.ndimage import distance_transform_edt
 
 from manyeyes.ops.raycast import BOX, ELLIPSOID, HeightField
+from manyeyes.simulator.scene.placement import PlacementGrid
 from manyeyes.simulator.scene.roadside_objects import (
-    PlacementGrid,
     RoadsideObjectSpec,
-    distance_transform,
     find_pole_sites,
     make_pole,
     place_roadside_objects,
@@ -24,11 +22,6 @@ def crossing() -> HeightField:
     surface[(u < 3.5) | (v < 3.5)] = 1
     height = np.tile(0.05 * np.arange(0, 200.1, 0.5), (401, 1)).astype(np.float32)
     return HeightField(height, surface, MIDDLE[0] - 100, MIDDLE[1] - 100, 0.5, 0.125)
-
-
-def test_distances_are_euclidean() -> None:
-    blocked = np.random.default_rng(0).random((60, 47)) < 0.03
-    np.testing.assert_allclose(distance_transform(blocked), distance_transform_edt(~blocked), atol=1e-9)
 
 
 def test_objects_are_placed_beside_roads_only() -> None:

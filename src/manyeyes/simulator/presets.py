@@ -14,6 +14,7 @@ from manyeyes.datatypes import ConfigError
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.simulator.dair import record_dair
 from manyeyes.simulator.record import Job, RecordingProgress, record
+from manyeyes.simulator.scene.environment import environment_spec
 from manyeyes.simulator.scene.scenario import ScenarioSpec
 from manyeyes.simulator.scene.towns import GENERATED, TOWN_SPLIT, assert_disjoint_split, find_town
 
@@ -23,13 +24,15 @@ class SplitPreset:
     """Scenes of one split: count of them, in turn over the towns.
 
     lidar_beams: number of LiDAR beams of all agents of a scene, in turn over the scenes; None for the preset's own sensors.
-    sensor_mix: as in ScenarioSpec; it replaces those sensors.
+    lidars: names in LIDAR_PRESETS of the vehicles' sensors, in turn over the scenes, in place of the preset's. sensor_mix: as in
+    ScenarioSpec; it replaces all these sensors.
     """
 
     split: str
     towns: tuple[str, ...]
     count: int
     lidar_beams: tuple[int | None, ...] = (None,)
+    lidars: tuple[str, ...] = ()
     sensor_mix: str = "none"
 
 
@@ -38,12 +41,13 @@ class SimulationPreset:
     """Contents of a recording.
 
     vehicles: minimum and maximum number of connected vehicles of a scene. roadside_chance: probability of a roadside unit,
-    which is always present with a single vehicle. lead_frames: frames before those of a scene (ScenarioSpec), so that the
-    sender of a message 0.4 s old had half a second of history. density, clutter: of traffic and of roadside objects
-    (ScenarioSpec), uniform between these for each scene. fallback_town: generated roads where a town is not found; None makes
-    that an error. layout: of the files; dair has one vehicle and the unit, and evaluates every pair. cameras, roadside_cameras:
-    as in ScenarioSpec. rates_hz: in turn over the scenes. intensity: a law for all sensors, None for each sensor's own. scene_key:
-    part of the random key of every scene; presets of one key have the same scenes with other sensors.
+    which is always present with a single vehicle, unless the environment has no other vehicles. lead_frames: frames before
+    those of a scene (ScenarioSpec), so that the sender of a message 0.4 s old had half a second of history. density, clutter:
+    of traffic and of roadside objects (ScenarioSpec), uniform between these for each scene. fallback_town: generated roads
+    where a town is not found; None makes that an error. layout: of the files; dair has one vehicle and the unit, and evaluates
+    every pair. cameras, roadside_cameras: as in ScenarioSpec. rates_hz: in turn over the scenes. intensity: a law for all
+    sensors, None for each sensor's own. scene_key: part of the random key of every scene; presets of one key have the same
+    scenes with other sensors. environment: name of a world in ENVIRONMENTS.
     """
 
     splits: tuple[SplitPreset, ...]
@@ -64,6 +68,7 @@ class SimulationPreset:
     roadside_cameras: str = "none"
     intensity: str | None = None
     scene_key: str = ""
+    environment: str = "classic"
 
     def __post_init__(self) -> None:
         if self.layout == "dair" and {self.cameras, self.roadside_cameras} != {"none"}:
@@ -111,6 +116,7 @@ _SENSORS = replace(
     lead_frames=0,
     rates_hz=(10.0, 10.0, 20.0),
     scene_key="sensors",
+    environment="urban-2026",
 )
 
 
@@ -185,6 +191,40 @@ _CROSSING = SimulationPreset(
     intensity="material",
 )
 
+# One sensor that looks up by 2 degrees, one of 32 beams, and one that looks up by 15 degrees.
+_THREE_LIDARS = ("opv2v-16", "v2xset", "argoverse2")
+
+
+def _hard_cases(train: int, val: int, test: int, more_val: tuple[str, ...] = ()) -> tuple[SplitPreset, ...]:
+    return (
+        SplitPreset("train", TOWN_SPLIT["train"], train, sensor_mix="all"),
+        SplitPreset("val", (*TOWN_SPLIT["val"], *more_val), val, lidars=_THREE_LIDARS),
+        SplitPreset("test", TOWN_SPLIT["test"], test, lidars=_THREE_LIDARS),
+    )
+
+
+# A single agent that is the only vehicle of its scene: every box that is detected is false.
+_NO_VEHICLES = SimulationPreset(
+    _hard_cases(30, 12, 48, (f"{GENERATED}21",)),
+    frames=9,
+    history_frames=4,
+    vehicles=(1, 1),
+    roadside_chance=0.0,
+    clutter=(0.6, 1.6),
+    environment="urban-2026-no-vehicles",
+)
+
+# Streets full of traffic and of parked vehicles, so that many of them are close to an agent.
+_NEAR_FIELD = SimulationPreset(
+    _hard_cases(20, 6, 24),
+    frames=9,
+    history_frames=4,
+    vehicles=(3, 4),
+    roadside_chance=0.0,
+    density=(7.0, 10.0),
+    environment="urban-2026",
+)
+
 SIMULATION_PRESETS: dict[str, SimulationPreset] = {
     "carla-towns-small": _crowded(_towns(150, 22, 84)),
     "carla-towns-large": _crowded(_towns(600, 60, 200)),
@@ -203,6 +243,8 @@ SIMULATION_PRESETS: dict[str, SimulationPreset] = {
     "dair-crossing": _CROSSING,
     # The vehicle's sensor as DAIR-V2X has it: denser at the horizon, and tilted.
     "dair-crossing-tilted": replace(_CROSSING, lidar="dair-pandar40p"),
+    "no-vehicles": _NO_VEHICLES,
+    "near-field": _NEAR_FIELD,
     "smoke-dair": replace(_CROSSING, splits=_SMOKE_SPLITS, frames=3, min_vehicles=4),
     "carla-sensors-small": _SENSORS,
     "carla-beams-16": _one_sensor("beams-16"),
@@ -252,7 +294,7 @@ def _lidar_of(name: str, beams: int | None) -> str:
 
 def make_jobs(preset: SimulationPreset, seed: int, towns: str | None = None) -> list[Job]:
     """Return the scenarios of a preset; each depends on seed, split and its number alone."""
-    jobs = []
+    jobs, is_alone = [], not environment_spec(preset.environment).other_vehicles
     key = (preset.scene_key,) if preset.scene_key else ()
     for part in preset.splits:
         # The folder's name is part of the random key: another name would change every scene.
@@ -271,8 +313,8 @@ def make_jobs(preset: SimulationPreset, seed: int, towns: str | None = None) -> 
                 history_frames=preset.history_frames,
                 lead_frames=preset.lead_frames,
                 rate_hz=preset.rates_hz[index % len(preset.rates_hz)],
-                roadside_chance=1.0 if vehicles == 1 else preset.roadside_chance,
-                lidar=_lidar_of(preset.lidar, beams),
+                roadside_chance=1.0 if vehicles == 1 and not is_alone else preset.roadside_chance,
+                lidar=part.lidars[index % len(part.lidars)] if part.lidars else _lidar_of(preset.lidar, beams),
                 roadside_lidar=_lidar_of(preset.roadside_lidar, beams),
                 density=round(float(random.uniform(*preset.density)), 3),
                 min_vehicles=preset.min_vehicles,
@@ -281,6 +323,7 @@ def make_jobs(preset: SimulationPreset, seed: int, towns: str | None = None) -> 
                 roadside_cameras=preset.roadside_cameras,
                 intensity=preset.intensity,
                 sensor_mix=part.sensor_mix,
+                environment=preset.environment,
             )
             jobs.append(Job(folder, spec, None if town.startswith(GENERATED) else towns))
     return sorted(jobs, key=lambda job: (job.split != "train", job.split != "validate", job.spec.town, job.spec.name))

@@ -8,12 +8,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from manyeyes.maps.roads.road_network import DRIVABLE, Lane, RoadNetwork
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.simulator.scene.vehicles import VehicleStates, draw_vehicles, overlaps
+from manyeyes.simulator.scene.vehicle_market import CLASSIC_MARKET, VehicleMarket, draw_vehicles
+from manyeyes.simulator.scene.vehicles import VehicleStates, overlaps
 
 Array = NDArray[np.float64]
 
 PARKED_ID = 1_000_000
-_KIND_FRACTIONS = (0.86, 0.12, 0.02, 0.0)
+# Marked spaces are for cars.
+_MAX_SPACE_M = 5.2
 _PITCH_M = 6.6
 _END_CLEARANCE_M = 9.0
 _CROSSING_CLEARANCE_M = 7.0
@@ -22,18 +24,24 @@ _MAX_SPEED_LIMIT_MPS = 20.0
 
 
 def parked_cars(
-    network: RoadNetwork, seed: int, center_xy: ArrayLike, radius_m: float, density: float = 0.45
+    network: RoadNetwork,
+    seed: int,
+    center_xy: ArrayLike,
+    radius_m: float,
+    density: float = 0.45,
+    market: VehicleMarket = CLASSIC_MARKET,
 ) -> VehicleStates:
-    """Parked vehicles within radius_m of a centre, speed 0; density: the mean share of places that are taken.
+    """Parked vehicles within radius_m of a centre, speed 0; density: the mean share of places that are
+    taken. market: which vehicles park.
 
     The draws belong to the lanes, not to the area: another centre gives the same vehicles where the areas overlap. None
     stands on a drivable lane, near a junction or a crossing, or on a road faster than 20 m/s.
     """
     center = np.asarray(center_xy, np.float64).reshape(2)
-    candidates = [_in_spaces(network, seed, density)]
+    candidates = [_in_spaces(network, seed, density, market)]
     for lane in network.lanes:
         if _has_kerb(network, lane) and np.linalg.norm(lane.center[:, :2] - center, axis=1).min() < radius_m + 10.0:
-            candidates.append(_cars_along_lane(network, lane, seed, density))
+            candidates.append(_cars_along_lane(network, lane, seed, density, market))
     cars = VehicleStates.cat(candidates)
     cars = cars[np.linalg.norm(cars.position[:, :2] - center, axis=1) <= radius_m]
     return _without_conflicts(network, cars)
@@ -47,7 +55,9 @@ def _has_kerb(network: RoadNetwork, lane: Lane) -> bool:
     return right < 0 or network.lanes[right].kind not in DRIVABLE
 
 
-def _cars_along_lane(network: RoadNetwork, lane: Lane, seed: int, density: float) -> VehicleStates:
+def _cars_along_lane(
+    network: RoadNetwork, lane: Lane, seed: int, density: float, market: VehicleMarket
+) -> VehicleStates:
     """Return places every 6.6 m beside the right border of a lane, each taken by chance."""
     random = keyed_generator(seed, "parked", lane.road_id, lane.section, lane.lane_id)
     border = lane.right
@@ -57,7 +67,7 @@ def _cars_along_lane(network: RoadNetwork, lane: Lane, seed: int, density: float
     # Some streets are full, some nearly empty: the mean stays.
     taken_prob = density * 2 * random.random()
     taken = random.random(len(places)) < taken_prob
-    kind, size = draw_vehicles(random, len(places), _KIND_FRACTIONS)
+    kind, size = draw_vehicles(random, len(places), market, "parked")
     shift, twist, turned = (
         random.normal(0, 0.35, len(places)),
         random.normal(0, 0.025, len(places)),
@@ -84,7 +94,7 @@ def _cars_along_lane(network: RoadNetwork, lane: Lane, seed: int, density: float
     return _states(lane.id * 1000 + np.arange(len(places)), kind, at, yaw, pitch, size)[taken]
 
 
-def _in_spaces(network: RoadNetwork, seed: int, density: float) -> VehicleStates:
+def _in_spaces(network: RoadNetwork, seed: int, density: float, market: VehicleMarket) -> VehicleStates:
     """Return cars in the file's marked spaces outside junctions, along the longer edge of each."""
     if not network.parking:
         return VehicleStates.empty()
@@ -93,7 +103,7 @@ def _in_spaces(network: RoadNetwork, seed: int, density: float) -> VehicleStates
     inside = {road.id for road in network.roads if road.junction_id is not None}
     free = np.array([space.road_id not in inside for space in network.parking])
     taken = free & (random.random(n) < min(1.0, 1.4 * density))
-    kind, size = draw_vehicles(random, n, (1.0, 0.0, 0.0, 0.0))
+    kind, size = draw_vehicles(random, n, market, "parked", _MAX_SPACE_M)
     corners = np.stack([space.polygon[:4] for space in network.parking])
     one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1]
     longer = np.linalg.norm(one, axis=1) > np.linalg.norm(two, axis=1)

@@ -10,25 +10,32 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from manyeyes.datatypes import LABELS, AgentFrame, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
+from manyeyes.datatypes import (
+    VEHICLE_LABELS,
+    AgentFrame,
+    Boxes,
+    ConfigError,
+    GroundTruth,
+    PointCloud,
+    Snapshot,
+    Transform,
+)
 from manyeyes.maps.roads.road_network import Junction, RoadNetwork
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.lidar.intensity import INTENSITY_LAWS
 from manyeyes.ops.raycast import HeightField, Primitives
+from manyeyes.simulator.scene.body_styles import make_market_shape
+from manyeyes.simulator.scene.environment import environment_spec
 from manyeyes.simulator.scene.ground import GroundRaster, build_ground, is_multilevel
 from manyeyes.simulator.scene.parking import parked_cars
-from manyeyes.simulator.scene.roadside_objects import (
-    PlacementGrid,
-    RoadsideObjectSpec,
-    find_pole_sites,
-    make_pole,
-    place_roadside_objects,
-)
+from manyeyes.simulator.scene.placement import PlacementGrid
+from manyeyes.simulator.scene.roadside_objects import find_pole_sites, make_pole
+from manyeyes.simulator.scene.surroundings import place_surroundings
+from manyeyes.simulator.scene.terrain import add_terrain, stand_on_ground
 from manyeyes.simulator.scene.traffic import simulate_traffic
 from manyeyes.simulator.scene.vehicle_shapes import (
     VehicleShape,
     box_centers,
-    make_vehicle_shape,
     place_vehicle_shapes,
     rotation_from_yaw_pitch,
 )
@@ -61,7 +68,8 @@ class ScenarioSpec:
     vehicles per kilometre of lane. min_vehicles: within 60 m of the crossing, or another crossing is drawn. clutter: factor on
     the numbers of RoadsideObjectSpec. cameras, roadside_cameras: names of CAMERA_RIGS, of each vehicle and of the unit, at its
     LiDAR's height. intensity: a name of INTENSITY_LAWS, of all sensors; None for each sensor's own law. sensor_mix: a name of
-    SENSOR_MIXES, from which the sensor of each agent is drawn; "none" for lidar and roadside_lidar as they are.
+    SENSOR_MIXES, from which the sensor of each agent is drawn; "none" for lidar and roadside_lidar as they are. environment:
+    name of a world in ENVIRONMENTS.
     """
 
     town: str
@@ -85,6 +93,7 @@ class ScenarioSpec:
     roadside_cameras: str = "none"
     intensity: str | None = None
     sensor_mix: str = "none"
+    environment: str = "classic"
 
     def __post_init__(self) -> None:
         if not (1 <= self.vehicles <= 6 and self.frames > self.history_frames >= 0 <= self.lead_frames):
@@ -177,7 +186,12 @@ class SimulatedScenario:
         """Return all that rays can meet at one instant."""
         states = self.states[index]
         moving = place_vehicle_shapes(
-            [self.shapes[int(i)] for i in states.id], states.position, states.yaw, states.pitch, states.id
+            [self.shapes[int(i)] for i in states.id],
+            states.position,
+            states.yaw,
+            states.pitch,
+            states.id,
+            states.roll,
         )
         return RaycastScene(Primitives.cat([self.static_solids, moving]), self.ground)
 
@@ -233,7 +247,7 @@ def _with_images(frame: AgentFrame, lit_scene: LitScene | None, rig: tuple[Camer
 
 def true_boxes(states: VehicleStates) -> Boxes:
     """Return the vehicles' boxes in the world frame, float64."""
-    center = box_centers(states.position, states.yaw, states.pitch, states.size[:, 2])
+    center = box_centers(states.position, states.yaw, states.pitch, states.size[:, 2], states.roll)
     place = torch.from_numpy(center), torch.from_numpy(states.size), torch.from_numpy(states.yaw)
     return Boxes.of(*place, label=torch.from_numpy(states.kind), id=torch.from_numpy(states.id))
 
@@ -259,7 +273,7 @@ def find_visible_boxes(
 
 
 def _pose(states: VehicleStates, row: int) -> Transform:
-    rotation = rotation_from_yaw_pitch(states.yaw[row : row + 1], states.pitch[row : row + 1])[0]
+    rotation = rotation_from_yaw_pitch(*(angle[row : row + 1] for angle in (states.yaw, states.pitch, states.roll)))[0]
     return Transform(torch.from_numpy(rotation), torch.from_numpy(states.position[row].copy()))
 
 
@@ -271,14 +285,16 @@ def to_height_field(ground: GroundRaster) -> HeightField:
 def make_scenario(spec: ScenarioSpec, network: RoadNetwork) -> SimulatedScenario:
     """Traffic of the whole town, one busy crossing of it, agents among the vehicles there, and what stands around.
 
-    Raises NoSceneError where no crossing has enough traffic; at least half of the vehicles near the chosen one move.
+    Raises NoSceneError where no crossing has enough traffic; at least the environment's fraction of the vehicles near the
+    chosen one moves.
     """
+    world = environment_spec(spec.environment)
     random = keyed_generator(spec.seed, "scenario", spec.town)
     # Dense traffic jams when it runs for long, and most signals of a town turn red together at 25 s.
     warmup_s = round(float(random.uniform(8.0, 15.0)), 1)
     lead = spec.lead_frames
     traffic = simulate_traffic(
-        network, spec.seed, spec.frames, 1 / spec.rate_hz, 9.0 * spec.density, warmup_s=warmup_s, lead_steps=lead
+        network, spec.seed, spec.frames, 1 / spec.rate_hz, 9.0 * spec.density, warmup_s, lead, world.market
     )
     # SUMO counts from 0, which is the instance of what is not a vehicle.
     traffic = tuple(replace(states, id=states.id + 1) for states in traffic)
@@ -289,17 +305,28 @@ def make_scenario(spec: ScenarioSpec, network: RoadNetwork) -> SimulatedScenario
         if len(agents) < spec.vehicles or not all((s.id == a).any() for a in agents for s in near):
             continue
         # Cheap refusals before the ground is drawn: a jam, and roads over roads.
-        if _find_moving(near[lead:]).mean() < 0.5 or is_multilevel(network, middle, 1.5 * _NEAR_M):
+        if _find_moving(near[lead:]).mean() < world.min_moving_fraction or is_multilevel(
+            network, middle, 1.5 * _NEAR_M
+        ):
             continue
         field = to_height_field(build_ground(network, middle, _HALF_SIZE_M))
         plot = PlacementGrid.of(field)
         states = tuple(s[np.abs(plot.height(s.position[:, :2]) - s.position[:, 2]) < _LEVEL_GAP_M] for s in near)
-        parked = parked_cars(network, spec.seed, middle, 110.0, float(random.uniform(0.1, 0.6)))
-        parked = _select_parked(states[lead:], parked, random)
+        taken = float(random.uniform(*world.parked_fraction))
+        parked = parked_cars(network, spec.seed, middle, 110.0, taken, world.market)
+        parked = _select_parked(states[lead:], parked, world.min_moving_fraction, random)
         states = tuple(VehicleStates.cat([now, parked]) for now in states)
-        if _find_moving(states[lead:]).mean() < 0.5 or not all((s.id == a).any() for a in agents for s in states):
+        if not all((s.id == a).any() for a in agents for s in states):
             continue
-        return _place_static_objects(spec, network, field, plot, states, agents, middle, random)
+        if _find_moving(states[lead:]).mean() < world.min_moving_fraction:
+            continue
+        if not world.other_vehicles:
+            states = tuple(now[np.isin(now.id, agents)] for now in states)
+        if world.terrain is not None:
+            field = add_terrain(field, world.terrain, middle, (spec.seed, spec.town))
+            plot = replace(plot, ground=field)
+            states = tuple(stand_on_ground(now, field) for now in states)
+        return _place_static_objects(spec, network, plot, states, agents, middle, random)
     raise NoSceneError(
         f"{spec.name}: no crossing in {spec.town} has {spec.min_vehicles} vehicles with {spec.vehicles} cars to connect "
         f"at seed {spec.seed}; another seed or a higher density may."
@@ -349,20 +376,20 @@ def _choose_agents(
 
 
 def _select_parked(
-    states: tuple[VehicleStates, ...], parked: VehicleStates, random: np.random.Generator
+    states: tuple[VehicleStates, ...], parked: VehicleStates, min_moving_fraction: float, random: np.random.Generator
 ) -> VehicleStates:
-    """Some of the parked cars, at most so many that half of all vehicles move."""
+    """Some of the parked cars, at most so many that the given fraction of all vehicles moves."""
     moving = _find_moving(states)
-    room = max(0, int(2 * moving.sum() - len(moving)))
+    room = max(0, int(moving.sum() / min_moving_fraction - len(moving)))
     return parked[np.sort(random.permutation(len(parked))[:room])]
 
 
 def _place_static_objects(
-    spec: ScenarioSpec, network: RoadNetwork, field: HeightField, plot: PlacementGrid, states: tuple[VehicleStates, ...],
+    spec: ScenarioSpec, network: RoadNetwork, plot: PlacementGrid, states: tuple[VehicleStates, ...],
     agents: tuple[int, ...], middle: Array, random: np.random.Generator,
 ) -> SimulatedScenario:  # fmt: skip
     """Return a roadside unit and everything that stands still, put around vehicles that are already there."""
-    drawn = states[spec.lead_frames]
+    drawn, world = states[spec.lead_frames], environment_spec(spec.environment)
     still = drawn[drawn.speed == 0]
     for position, size, yaw in zip(still.position, still.size, still.yaw):
         plot.occupy(position[:2], (float(size[0]) / 2 + 0.5, float(size[1]) / 2 + 0.5), float(yaw))
@@ -373,19 +400,16 @@ def _place_static_objects(
         xyz = roadside.world_from_agent.translation.numpy()
         plot.occupy(xyz[:2], (1.0, 1.0), 0.0)
         solids.append(make_pole(xyz[:2], float(xyz[2]), roadside.lidar.height_m - 0.3, RSU_ID))
-    wish = RoadsideObjectSpec()
-    clutter = RoadsideObjectSpec(
-        *(round(spec.clutter * n) for n in (wish.buildings, wish.walls, wish.poles, wish.trees, wish.hedges))
-    )
-    solids.append(
-        place_roadside_objects(plot, replace(clutter, setback_m=float(random.uniform(1.5, 6.0))), middle, (spec.seed,))
-    )
+    setback_m = float(random.uniform(1.5, 6.0))
+    solids.append(place_surroundings(plot, world, spec.clutter, setback_m, middle, states, (spec.seed,)))
     shapes: dict[int, VehicleShape] = {}
     for now in states:
         for id, kind, size in zip(now.id.tolist(), now.kind.tolist(), now.size.tolist()):
             if id not in shapes:
-                shapes[id] = make_vehicle_shape(LABELS[kind], tuple(size), spec.seed, id)
-    return SimulatedScenario(spec, network, field, Primitives.cat(solids), states, shapes, agents, roadside, middle)
+                shapes[id] = make_market_shape(world.market, VEHICLE_LABELS[kind], tuple(size), spec.seed, id)
+    return SimulatedScenario(
+        spec, network, plot.ground, Primitives.cat(solids), states, shapes, agents, roadside, middle
+    )
 
 
 def _roadside(

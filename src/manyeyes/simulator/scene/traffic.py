@@ -21,7 +21,8 @@ from manyeyes.maps.roads.road_network import RoadNetwork
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.simulator.scene.parking import parked_cars
 from manyeyes.simulator.scene.towns import run_sumo_tool
-from manyeyes.simulator.scene.vehicles import VehicleStates, draw_vehicles, overlaps
+from manyeyes.simulator.scene.vehicle_market import CLASSIC_MARKET, VehicleMarket, draw_vehicles
+from manyeyes.simulator.scene.vehicles import VehicleStates, overlaps
 
 Array = NDArray[np.float64]
 
@@ -67,14 +68,14 @@ def simulate_traffic(
     steps: int,
     step_s: float = 0.1,
     vehicles_per_lane_km: float = 9.0,
-    count: int | None = None,
     warmup_s: float = 60.0,
     lead_steps: int = 0,
+    market: VehicleMarket = CLASSIC_MARKET,
 ) -> tuple[VehicleStates, ...]:
     """Moving and waiting vehicles of the whole network, one VehicleStates a step, after warmup_s of driving.
 
-    Each vehicle walks the net at random, far enough not to arrive before the end. count overrides vehicles_per_lane_km. lead_steps:
-    the last so many steps of the warm-up come first; the others stay as they are.
+    Each vehicle walks the net at random, far enough not to arrive before the end. lead_steps:
+    the last so many steps of the warm-up come first; the others stay as they are. market: which vehicles drive.
     """
     if steps < 1 or step_s <= 0 or not 0 <= lead_steps * step_s <= warmup_s:
         raise ConfigError(
@@ -83,9 +84,9 @@ def simulate_traffic(
         )
     net = sumo_net(network)
     edges = _read_edges(net)
-    wanted = round(vehicles_per_lane_km * float((edges.length * edges.lanes).sum()) / 1000) if count is None else count
+    wanted = round(vehicles_per_lane_km * float((edges.length * edges.lanes).sum()) / 1000)
     random = keyed_generator(seed, "traffic", network.name)
-    kind, size = draw_vehicles(random, wanted)
+    kind, size = draw_vehicles(random, wanted, market)
     with tempfile.TemporaryDirectory(prefix="manyeyes-sumo-") as folder:
         routes = Path(folder) / "routes.rou.xml"
         _write_routes(routes, edges, kind, size, random, duration_s=warmup_s + steps * step_s)

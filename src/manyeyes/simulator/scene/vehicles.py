@@ -1,27 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands and drives on the roads at one instant, and how large such vehicles are."""
+"""What stands and drives on the roads at one instant."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.datatypes import VEHICLE_LABELS, ShapeError
+from manyeyes.datatypes import ShapeError
 
 Array = NDArray[np.float64]
-
-KIND_FRACTIONS = (0.78, 0.10, 0.07, 0.05)
-# Low and high of length, width, height in metres, by LABELS: what drives in European cities.
-_SIZE_RANGES = np.array(
-    [
-        [[3.6, 5.1], [1.7, 2.0], [1.35, 1.8]],
-        [[5.2, 6.0], [1.95, 2.05], [2.0, 2.6]],
-        [[6.5, 10.0], [2.3, 2.55], [2.8, 3.6]],
-        [[10.0, 12.5], [2.5, 2.55], [3.0, 3.3]],
-    ]
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +20,8 @@ class VehicleStates:
     id: (N,) int64. kind: (N,) int64, index into LABELS. position: (N, 3) metres, the middle of the footprint on the road (not
     the box's centre, which is half a height above). yaw: (N,) radians about +z, 0 along +x. pitch: (N,) radians as
     Transform.from_rpy takes it: right-handed about the left axis, so that uphill is negative. speed: (N,) m/s.
-    size: (N, 3) length, width, height.
+    size: (N, 3) length, width, height. roll: (N,) radians about the forward axis, positive where the left side is higher; zero
+    when left out.
     """
 
     id: NDArray[np.int64]
@@ -41,14 +31,19 @@ class VehicleStates:
     pitch: Array
     speed: Array
     size: Array
+    roll: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         n = len(self.id)
+        if not len(self.roll):
+            object.__setattr__(self, "roll", np.zeros(n))
         wanted = {"position": (n, 3), "size": (n, 3)}
-        for field in fields(self):
-            shape = getattr(self, field.name).shape
-            if shape != wanted.get(field.name, (n,)):
-                raise ShapeError(f"VehicleStates.{field.name} needs shape {wanted.get(field.name, (n,))}; got {shape}.")
+        for column in fields(self):
+            shape = getattr(self, column.name).shape
+            if shape != wanted.get(column.name, (n,)):
+                raise ShapeError(
+                    f"VehicleStates.{column.name} needs shape {wanted.get(column.name, (n,))}; got {shape}."
+                )
 
     @classmethod
     def empty(cls) -> VehicleStates:
@@ -74,17 +69,6 @@ class VehicleStates:
         c, s = np.cos(self.yaw)[:, None], np.sin(self.yaw)[:, None]
         turned = np.stack((local[..., 0] * c - local[..., 1] * s, local[..., 0] * s + local[..., 1] * c), -1)
         return turned + self.position[:, None, :2]
-
-
-def draw_vehicles(
-    random: np.random.Generator, count: int, kind_fractions: tuple[float, ...] = KIND_FRACTIONS
-) -> tuple[NDArray[np.int64], Array]:
-    """Return kinds (N,) by shares over LABELS, and sizes (N, 3); long cars tend to be wide ones."""
-    kind = random.choice(len(VEHICLE_LABELS), count, p=kind_fractions).astype(np.int64)
-    unit = random.random((count, 3))
-    unit[:, 1] = (unit[:, 0] + unit[:, 1]) / 2
-    low, high = _SIZE_RANGES[kind, :, 0], _SIZE_RANGES[kind, :, 1]
-    return kind, low + unit * (high - low)
 
 
 def overlaps(corners: Array, others: Array) -> NDArray[np.bool_]:
