@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
 
 from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, Snapshot, Transform
 from manyeyes.ops.keyed_random import keyed_generator
+from manyeyes.ops.lidar.intensity import INTENSITY_LAWS
 from manyeyes.ops.raycast import BOX, CYLINDER, ELLIPSOID, HeightField, Primitives
 from manyeyes.simulator.scene.vehicle_shapes import make_vehicle_shape, place_vehicle_shapes, rotation_from_yaw_pitch
 from manyeyes.simulator.sensors.lidar import RaycastScene, scan
@@ -17,6 +19,7 @@ from manyeyes.simulator.sensors.lidars import lidar_spec
 
 CARS, BUILDINGS, POLES, TREES = 55, 40, 40, 50
 ROAD_HALF_M = 8.0
+LIDAR = replace(lidar_spec("opv2v"), intensity=INTENSITY_LAWS["material"])
 
 
 def street(agents: int = 5, seed: int = 0) -> Snapshot:
@@ -38,7 +41,7 @@ def street(agents: int = 5, seed: int = 0) -> Snapshot:
         pose = Transform(
             torch.from_numpy(rotation_from_yaw_pitch(yaw[i : i + 1], zero[:1])[0]), torch.from_numpy(position[i].copy())
         )
-        cloud, instance = scan(scene, pose, lidar_spec("opv2v"), ("street", seed, int(i)), own=int(ids[i]))
+        cloud, instance = scan(scene, pose, LIDAR, ("street", seed, int(i)), own=int(ids[i]))
         frames.append(AgentFrame.of(cloud, pose, agent_id=int(ids[i])))
         visible.append(torch.from_numpy(np.isin(ids, instance)))
     truth = GroundTruth(boxes, torch.stack(visible), Transform.stack([f.world_from_agent for f in frames]))

@@ -288,7 +288,7 @@ def _town_or_fallback(name: str, towns: str | None, fallback_town: str | None) -
 
 
 def _lidar_of(name: str, beams: int | None) -> str:
-    """Name the sensor of LIDAR_PRESETS with this number of beams."""
+    """Name the sensor of the table with this number of beams."""
     return name if beams is None else f"{name}-{beams}"
 
 
