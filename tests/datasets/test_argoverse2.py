@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from manyeyes.agents.level_frame import LevelledFrame
 from manyeyes.cli.main import main
 from manyeyes.datasets.argoverse2 import Argoverse2Recording
 from manyeyes.datasets.base import count_points_in_listed_boxes
@@ -276,3 +277,26 @@ def test_without_pyarrow_a_recording_is_not_opened(log: Path, monkeypatch: pytes
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'manyeyes\[av2\]'"):
         Argoverse2Recording(log.parent, gap=1)
+
+
+@real
+def test_the_fitted_road_is_under_the_vehicles(pair: Snapshot) -> None:
+    """Boxes are labelled by people: on levelled frames their bottoms lie on z = 0, up to 50 m; on AV2's own frames they do not."""
+    assert pair.truth is not None
+    for row, frame in enumerate(pair.frames):
+        level = LevelledFrame.of(frame)
+        assert level.levelled is not frame
+        error_m = []
+        for some in (frame, level.levelled):
+            boxes = pair.truth.boxes[pair.truth.seen[row]].transform(some.world_from_agent.inverse())
+            distance = boxes.center[:, :2].norm(dim=1)
+            bottom = boxes.center[:, 2] - boxes.size[:, 2] / 2
+            error_m.append(float(bottom[(distance > 25) & (distance < 50)].abs().mean()))
+        assert error_m[0] > 0.25 and error_m[1] < 0.15
+
+
+@real
+def test_the_body_is_ahead_of_the_rear_axle_and_holds_no_return(pair: Snapshot) -> None:
+    for frame in pair.frames:
+        assert frame.body is not None and frame.body.center == pytest.approx((1.34, 0.0, 0.74))
+        assert not frame.body.contains(frame.points.xyz).any()

@@ -155,3 +155,18 @@ def test_agents_are_cars_in_range_at_the_first_frame_that_stay_and_keep_the_gap(
     near = (make_states(kinds, {1: -9.0, 2: 9.0}), make_states(kinds, {1: -1.0, 2: 1.0}))
     assert _choose_agents(near, np.zeros(2), spec, np.random.default_rng(0)) == (1, 2)
     assert len(_choose_agents(near, np.zeros(2), replace(spec, vehicles=1), np.random.default_rng(0))) == 1
+
+
+def test_the_body_of_an_agent_is_its_true_box(snapshot: Snapshot) -> None:
+    assert snapshot.truth is not None
+    for frame in snapshot.frames:
+        if frame.is_infrastructure:
+            assert frame.body is None
+            continue
+        own = snapshot.truth.boxes[snapshot.truth.boxes.id == frame.agent_id]
+        assert frame.body is not None
+        placed = frame.body.boxes(torch.float64).transform(frame.world_from_agent)
+        assert torch.allclose(placed.center, own.center, atol=1e-6) and torch.allclose(placed.size, own.size)
+        assert float((placed.yaw - own.yaw).cos()) > 0.9999
+        assert frame.body.center[:2] == pytest.approx((0.0, 0.0), abs=0.01)
+        assert not frame.body.contains(frame.points.xyz.double(), 0.05).any()

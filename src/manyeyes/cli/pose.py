@@ -158,15 +158,16 @@ def _run_correctors(
     drive: Excerpt, cache: PerceptionCache, options: Options, noise: PoseNoise
 ) -> Iterator[CorrectorResult]:
     """Yield every corrector's estimate of the pose of every collaborator in every evaluated frame."""
+    from manyeyes.agents.level_frame import SnapshotLeveller
     from manyeyes.agents.pose_correction import PoseCorrection
     from manyeyes.pose.registry import find_corrector
     from manyeyes.pose.types import PosePrior
 
-    names = options.correctors
+    names, level = options.correctors, SnapshotLeveller()
     correctors = {name: find_corrector(name) for name in names}
     aligners = {n: PoseCorrection(n, options.min_score) for n, c in correctors.items() if c.kind == "landmarks"}
     for index in drive.eval_indices(drive.scenario):
-        snapshot = drive.snapshot(drive.scenario, index)
+        snapshot = level(drive.snapshot(drive.scenario, index))
         perturbed = noise.apply(snapshot, 0)
         inputs: dict[str, list[Any]] = {
             name: [

@@ -21,6 +21,7 @@ from manyeyes.datasets.lidar_frame import rotation_of_quaternion
 from manyeyes.datasets.registry import register_dataset
 from manyeyes.datatypes import (
     LABELS,
+    AgentBody,
     AgentFrame,
     Boxes,
     ConfigError,
@@ -35,6 +36,9 @@ from manyeyes.datatypes.extras import import_extra
 _POSES = "city_SE3_egovehicle.feather"
 _AXLE_HEIGHT_M = 0.33
 _LIDAR_ABOVE_AXLE_M = 1.64
+# The vehicles are Ford Fusion Hybrids of 2013 to 2020: length, width and height by the maker; the middle of the body lies ahead of
+# the rear axle by half the length less the rear overhang.
+_BODY = AgentBody.standing(1.34, 0.0, (4.87, 1.85, 1.48))
 _REMEDY = "copy or download the file again"
 # Box ids start here, so that none is the id of an agent (0 and 1).
 _FIRST_BOX_ID = 100
@@ -178,6 +182,7 @@ class Argoverse2Recording(RecordingReader):
             pose_covariance=torch.zeros(3, 3, dtype=torch.float64),
             sensor_height_m=_AXLE_HEIGHT_M + _LIDAR_ABOVE_AXLE_M,
             speed_mps=self._speed(scenario, timestamp_ns),
+            body=_BODY,
         )
 
     def _poses(self, scenario: str) -> tuple[np.ndarray, ...]:

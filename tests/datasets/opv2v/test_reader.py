@@ -614,3 +614,14 @@ def test_the_writer_rejects_content_beyond_the_format(
 def test_the_protocol_must_agree_with_the_frames(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"is 0\.1, but the frames were written with 0\.05"):
         Opv2vWriter(tmp_path).close({"world": {"fixed_delta_seconds": 0.1}})
+
+
+def test_the_body_lies_half_a_metre_ahead_of_the_lidar(dataset: Path, scenario: Path) -> None:
+    frames = Opv2vRecording(dataset, "train").snapshot("2021_08_16_22_26_54", 0).frames
+    for frame in frames[:2]:
+        assert frame.body is not None and frame.body.center == pytest.approx((0.5, 0.0, 0.75), abs=1e-6)
+        assert frame.body.yaw_rad == pytest.approx(0.0, abs=1e-6)
+    assert frames[2].is_infrastructure and frames[2].body is None
+    edit(scenario / "641" / "00068.yaml", lambda c: c.pop("true_ego_pos"))
+    edit(scenario / "1045" / "00068.yaml", lambda c: c.update(true_ego_pos=[0.0] * 6))
+    assert [frame.body for frame in Opv2vRecording(scenario).snapshot("drive", 0).frames] == [None] * 3

@@ -10,6 +10,7 @@ its own error (both read as zero), nor vehicles that no agent lists.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -49,11 +50,14 @@ from manyeyes.datasets.opv2v.scan import (
     scan_scenario,
 )
 from manyeyes.datasets.registry import register_dataset
-from manyeyes.datatypes import AgentFrame, GroundTruth, PointCloud, RecordingError, Snapshot, Transform
+from manyeyes.datatypes import AgentBody, AgentFrame, GroundTruth, PointCloud, RecordingError, Snapshot, Transform
 
 _MAX_CACHED_RECORDS = 20_000
 # How many first frames are searched for one that lists objects, and so tells the data set.
 _MAX_TOLD_STEMS = 20
+# Of CARLA's Lincoln MKZ, which carries the sensors of OPV2V and V2XSet.
+_BODY_SIZE_M = (4.9, 2.1, 1.5)
+_MAX_LIDAR_OFFSET_M = 5.0
 
 
 @register_dataset(
@@ -280,6 +284,7 @@ class Opv2vRecording(RecordingReader):
             sensor_height_m=height,
             speed_mps=record.speed_kmh / KMH_PER_MPS,
             is_infrastructure=record.is_infrastructure,
+            body=None if dialect.is_right_handed else _carla_body(record, world_from_agent),
             images=read_images(yaml, world_from_agent, self._cache) if images else (),
         )
 
@@ -320,6 +325,20 @@ def _stated_height(record: AgentRecord, world_from_lidar: Transform) -> float | 
     height = float(offset @ world_from_lidar.rotation[:, 2])
     low, high = PLAUSIBLE_HEIGHT_M
     return height if low <= height <= high and float(offset.norm()) <= high else None
+
+
+def _carla_body(record: AgentRecord, world_from_agent: Transform) -> AgentBody | None:
+    """Return the vehicle at the record's own pose, in the agent's frame; None where that pose says nothing plausible.
+
+    OPV2V's LiDAR stands 0.5 m behind the middle of the vehicle. The size is that of all vehicles with sensors there.
+    """
+    if record.is_infrastructure or not np.isfinite(record.ego_pose).all():
+        return None
+    agent_from_vehicle = world_from_agent.inverse() @ transform_from_carla(record.ego_pose)
+    x, y, _ = agent_from_vehicle.translation.tolist()
+    if math.hypot(x, y) > _MAX_LIDAR_OFFSET_M:
+        return None
+    return AgentBody.standing(x, y, _BODY_SIZE_M, float(agent_from_vehicle.yaw))
 
 
 def _state(files: Sequence[Path], folder: Path) -> np.ndarray:

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from manyeyes.agents.descriptors import extract_own_keypoints
+from manyeyes.agents.level_frame import SnapshotLeveller
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.comms import wire
 from manyeyes.datasets.base import Recording
@@ -109,13 +110,14 @@ def iterate_landmark_pairs(
 
     Landmarks are boxes of at least min_score. net: computes their descriptors, for correctors that use them.
     """
+    level = SnapshotLeveller()
     for scenario in recording.scenarios:
         caches: dict[int, PerceptionCache] = {}
         for index in recording.eval_indices(scenario)[::frame_stride]:
             # A detector of two sweeps sees the one before as well.
-            for frame in recording.snapshot(scenario, index - 1).frames if index else ():
+            for frame in level(recording.snapshot(scenario, index - 1)).frames if index else ():
                 caches.setdefault(frame.agent_id, PerceptionCache(detector)).process(frame)
-            snapshot = recording.snapshot(scenario, index)
+            snapshot = level(recording.snapshot(scenario, index))
             keypoints = [
                 _detect_keypoints(caches.setdefault(f.agent_id, PerceptionCache(detector)), f, net)
                 for f in snapshot.frames

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import torch
 
+from manyeyes.agents.level_frame import SnapshotLeveller
 from manyeyes.agents.own_detections import remove_own_body
 from manyeyes.agents.perception_cache import PerceptionCache, TokenOutput
 from manyeyes.datasets.base import Recording
@@ -81,9 +82,10 @@ def run_ablation(
     accumulators = {(variant.name, sigma): _VariantAccumulator() for variant in variants for sigma in sigmas}
     if len(accumulators) < len(variants) * len(sigmas):
         raise ConfigError(f"Branches have names of their own; got {', '.join(b.name for b in variants)}.")
+    level = SnapshotLeveller()
     for scenario in recording.scenarios:
         for index in recording.eval_indices(scenario)[::frame_stride]:
-            snapshots = [recording.snapshot(scenario, i) for i in range(max(0, index - 1), index + 1)]
+            snapshots = [level(recording.snapshot(scenario, i)) for i in range(max(0, index - 1), index + 1)]
             truth = select_ego_truth(snapshots[-1], 0, protocol)
             for variant in variants:
                 views = _CachedViews(variant, snapshots)

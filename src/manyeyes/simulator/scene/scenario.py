@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from manyeyes.datatypes import (
     VEHICLE_LABELS,
+    AgentBody,
     AgentFrame,
     Boxes,
     ConfigError,
@@ -234,8 +235,18 @@ class SimulatedScenario:
             sensor_height_m=lidar.height_m,
             speed_mps=speed,
             is_infrastructure=agent < 0,
+            body=_own_body(boxes, agent, pose),
         )
         return frame, find_visible_boxes(points, instance, pose, boxes, agent)
+
+
+def _own_body(boxes: Boxes, agent: int, world_from_agent: Transform) -> AgentBody | None:
+    """Return the vehicle of an agent in its frame; None of a roadside unit."""
+    own = boxes[boxes.id == agent].transform(world_from_agent.inverse())
+    if not len(own):
+        return None
+    (x, y, z), (length, width, height) = own.center[0].tolist(), own.size[0].tolist()
+    return AgentBody((x, y, z), (length, width, height), float(own.yaw[0]))
 
 
 def _with_images(frame: AgentFrame, lit_scene: LitScene | None, rig: tuple[CameraSpec, ...]) -> AgentFrame:

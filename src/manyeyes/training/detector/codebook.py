@@ -93,10 +93,11 @@ def collect_shared_tokens(detector: Detector, recording: Recording, frame_stride
         snapshot = recording.snapshot(scenario, index)
         for frame in snapshot.frames:
             cache = PerceptionCache(detector)
+            level = cache.level
             for before in earlier.frames if earlier else ():
                 if before.agent_id == frame.agent_id:
-                    cache.process(before)
-            yield cache.process_tokens(frame).shared_tokens.features
+                    cache.process(level(before).levelled)
+            yield cache.process_tokens(level(frame).levelled).shared_tokens.features
 
 
 def fit_codebook(

@@ -18,6 +18,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from manyeyes._io import atomic_write
+from manyeyes.agents.level_frame import SnapshotLeveller
 from manyeyes.agents.perception_cache import PerceptionCache, TokenOutput
 from manyeyes.datasets.base import Recording
 from manyeyes.datatypes import BevGrid, Boxes, ConfigError, RecordingError, Sites, Snapshot, SparseBev, Transform
@@ -97,14 +98,14 @@ def build_cache(
 
     Each agent processes the preceding snapshot too, for detectors with several sweeps.
     """
-    folder, done = root / detector.fingerprint.hex(), []
+    folder, done, level = root / detector.fingerprint.hex(), [], SnapshotLeveller()
     for scenario, index in select_snapshots(recording, frame_stride):
         path = _file(folder, scenario, index)
         if not path.exists():
             caches = {agent: PerceptionCache(detector) for agent in recording.agents(scenario)}
             for before in range(max(0, index - 1), index):
-                _run_detectors(caches, recording.snapshot(scenario, before))
-            snapshot = recording.snapshot(scenario, index)
+                _run_detectors(caches, level(recording.snapshot(scenario, before)))
+            snapshot = level(recording.snapshot(scenario, index))
             views = tuple(
                 DetectorView.of(sight.shared_tokens, sight.boxes) for sight in _run_detectors(caches, snapshot)
             )
