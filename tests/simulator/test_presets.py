@@ -106,6 +106,12 @@ def test_presets_of_published_tables_store_material_intensity_of_todays_sensors(
         assert specs == {("material", "none")}, name
 
 
+@pytest.mark.parametrize("name", ["carla-sensors-small", "no-vehicles", "near-field"])
+def test_training_scenes_of_mixed_sensors_store_material_intensity_which_other_laws_are_drawn_from(name: str) -> None:
+    preset = simulation_preset(name)
+    assert preset.intensity == "material" and any(part.split == "train" for part in preset.splits)
+
+
 def test_mixed_sensors_train_on_the_towns_and_rates_stated() -> None:
     jobs = make_jobs(simulation_preset("carla-sensors-small"), 0)
     train = [job for job in jobs if job.split == "train"]

@@ -211,6 +211,7 @@ _NO_VEHICLES = SimulationPreset(
     vehicles=(1, 1),
     roadside_chance=0.0,
     clutter=(0.6, 1.6),
+    intensity="material",
     environment="urban-2026-no-vehicles",
 )
 
@@ -222,6 +223,7 @@ _NEAR_FIELD = SimulationPreset(
     vehicles=(3, 4),
     roadside_chance=0.0,
     density=(7.0, 10.0),
+    intensity="material",
     environment="urban-2026",
 )
 
