@@ -21,6 +21,30 @@ def test_loops_equal_the_padded_twin(tokens: int, windows: int, width: int) -> N
     assert torch.allclose(ours, window_attention(q, k, v, window, window), atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("tokens", "windows", "width"), [(1, 1, 4), (40, 40, 8), (150, 3, 16), (300, 60, 32), (390, 2, 12), (131, 1, 4)]
+)
+def test_gradients_equal_those_of_the_padded_twin(tokens: int, windows: int, width: int) -> None:
+    random = keyed_torch_generator("gradients", tokens)
+    window = torch.randint(windows, (tokens,), generator=random) * 7 - 3
+    given = [torch.randn(tokens, 2, width, generator=random) * 1.5 for _ in range(4)]
+    found = []
+    for double in (False, True):
+        q, k, v = (t.to(torch.float64 if double else torch.float32).requires_grad_() for t in given[:3])
+        out = window_attention(q, k, v, window, window) if double else attend_in_windows(q, k, v, window_runs(window))
+        found.append(torch.autograd.grad(out, (q, k, v), given[3].to(out.dtype)))
+    for ours, twin in zip(*found, strict=True):
+        assert ours.dtype == torch.float32
+        # One token alone has weight 1 whatever its score: its query and key have no gradient.
+        assert float((ours - twin).norm()) <= 2e-6 * max(1.0, float(twin.norm()))
+
+
+def test_gradients_of_no_token() -> None:
+    none = torch.zeros(0, 2, 8, requires_grad=True)
+    out = attend_in_windows(none, none, none, window_runs(torch.zeros(0, dtype=torch.int64)))
+    assert torch.autograd.grad(out.sum(), none)[0].shape == none.shape
+
+
 def test_scores_of_any_size_do_not_overflow() -> None:
     q = torch.full((5, 1, 4), 90.0)
     out = attend_in_windows(q, q, torch.arange(20.0).view(5, 1, 4), window_runs(torch.zeros(5, dtype=torch.int64)))

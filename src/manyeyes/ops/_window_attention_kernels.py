@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-attention within windows in compiled loops: for inference on the CPU.
+"""Self-attention within windows in compiled loops, on the CPU.
 
 A window costs no call of its own and is padded to whole vectors at most. Queries lie along the vectors, so that scores,
-softmax and mixture need no sum across one. :mod:`manyeyes.ops.window_attention` is the twin with gradients.
+softmax and mixture need no sum across one. Backward computes the scores again and keeps none, as in FlashAttention (Dao et al.
+2022, section 3.1). :mod:`manyeyes.ops.window_attention` is the twin of tensor operations.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -58,17 +60,60 @@ def _starts(ids: I64x1) -> I64x1:  # pragma: no cover
     return start[: runs + 1]
 
 
-@torch.no_grad()
 def attend_in_windows(q: Tensor, k: Tensor, v: Tensor, runs: WindowRuns) -> Tensor:
-    """softmax(q k^T / sqrt(d)) v of (N, h, d) float32 over the tokens of each window: (N, h, d); d divisible by 4."""
+    """softmax(q k^T / sqrt(d)) v of (N, h, d) float32 over the tokens of each window: (N, h, d); d divisible by 4.
+
+    Differentiable once.
+    """
     if q.shape[2] % 4 or not q.shape == k.shape == v.shape:
         raise ShapeError(
             f"q, k, v are (N, h, d), d divisible by 4; got {tuple(q.shape)}, {tuple(k.shape)}, {tuple(v.shape)}."
         )
-    out = torch.empty_like(v, memory_format=torch.contiguous_format)
-    q_, k_, v_, out_ = (t.contiguous().view(-1).numpy() for t in (q, k, v, out))
-    attend(q_, k_, v_, out_, q.shape[1], q.shape[2], runs.order.numpy(), runs.start.numpy())
+    out: Tensor = _Attend.apply(q, k, v, runs)  # pyright: ignore[reportAssignmentType]
     return out
+
+
+class _Attend(torch.autograd.Function):
+    """Keeps the inputs alone for its backward pass."""
+
+    @staticmethod
+    def forward(ctx: Any, q: Tensor, k: Tensor, v: Tensor, runs: WindowRuns) -> Tensor:
+        ctx.save_for_backward(q, k, v)
+        ctx.runs = runs
+        out = torch.empty_like(v, memory_format=torch.contiguous_format)
+        q_, k_, v_, out_ = _flat(q, k, v, out)
+        attend(q_, k_, v_, out_, q.shape[1], q.shape[2], runs.order.numpy(), runs.start.numpy())
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
+        q, k, v = ctx.saved_tensors
+        dq, dk, dv = (torch.zeros_like(t, memory_format=torch.contiguous_format) for t in (q, k, v))
+        order, start = ctx.runs.order.numpy(), ctx.runs.start.numpy()
+        given = _Given(*_flat(q, k, v, grads[0]))
+        _attend_backward(given, _Gradients(*_flat(dq, dk, dv)), q.shape[1], q.shape[2], order, start)
+        return dq, dk, dv, None
+
+
+class _Given(NamedTuple):
+    """Queries, keys, values, and the gradient of the output, each (N * h * d,)."""
+
+    q: F32x1
+    k: F32x1
+    v: F32x1
+    grad: F32x1
+
+
+class _Gradients(NamedTuple):
+    """Gradients of queries, keys and values, each (N * h * d,)."""
+
+    q: F32x1
+    k: F32x1
+    v: F32x1
+
+
+def _flat(*tensors: Tensor) -> list[F32x1]:
+    return [t.detach().contiguous().view(-1).numpy() for t in tensors]
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
@@ -83,6 +128,7 @@ def attend(
     # With a column for each query.
     queries, mixed = np.empty(width * _TILE, np.float32), np.empty(width * _TILE, np.float32)
     weights, sums = np.empty(max_keys * _TILE, np.float32), np.empty(2 * _TILE, np.float32)
+    scale = np.float32(math.log2(math.e) / math.sqrt(width))
     for w in range(start.shape[0] - 1):
         n = start[w + 1] - start[w]
         padded = (n + 3) // 4 * 4
@@ -94,7 +140,7 @@ def attend(
                 count = min(n - at, _TILE)
                 wide = (count + _VECTOR - 1) // _VECTOR * _VECTOR
                 some = rows[at : at + (count + 3) // 4 * 4]
-                _gather(q, some, width, wide, queries)
+                _gather(q, some, width, wide, scale, queries)
                 _scores(k, rows, queries, weights, padded, width, wide)
                 weights[n * _TILE : padded * _TILE] = np.float32(-1e30)
                 _exponentials(weights, padded, wide, sums)
@@ -105,9 +151,10 @@ def attend(
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _gather(x: F32x1, rows: Uintpx1, width: int, wide: int, columns: F32x1) -> None:  # pragma: no cover
-    """columns[c, i] = x[rows[i] + c] times log2(e) / sqrt(width), and zeros up to wide."""
-    scale = np.float32(math.log2(math.e) / math.sqrt(width))
+def _gather(
+    x: F32x1, rows: Uintpx1, width: int, wide: int, scale: np.float32, columns: F32x1
+) -> None:  # pragma: no cover
+    """columns[c, i] = x[rows[i] + c] * scale, and zeros up to wide."""
     for i in range(0, rows.shape[0], 4):
         a, b, d, e, at = rows[i], rows[i + 1], rows[i + 2], rows[i + 3], np.uintp(i)
         for c in range(np.uintp(width)):
@@ -214,3 +261,92 @@ def power_of_two(x: np.float32) -> np.float32:  # pragma: no cover
     for n in (5, 4, 3, 2, 1, 0):
         y = y * f + _POWERS[n]
     return y * np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _attend_backward(
+    given: _Given, gradients: _Gradients, heads: int, width: int, order: I64x1, start: I64x1
+) -> None:  # pragma: no cover
+    """Write the gradients, which are zeros at first. Window by window and head by head, in tiles of queries and of keys."""
+    (q, k, v, grad), (dq, dk, dv) = given, gradients
+    max_keys = 4
+    for w in range(start.shape[0] - 1):
+        max_keys = max(max_keys, (start[w + 1] - start[w] + 3) // 4 * 4)
+    rows, sums = np.empty(max_keys, np.uintp), np.empty(2 * _TILE, np.float32)
+    # With a column for each query.
+    queries, outer = np.empty(width * _TILE, np.float32), np.empty(width * _TILE, np.float32)
+    weights, slopes = np.empty(max_keys * _TILE, np.float32), np.empty(max_keys * _TILE, np.float32)
+    # With a column for each key: a tile turned round, and what is mixed by it.
+    turned, mixed = np.empty(_TILE * _TILE, np.float32), np.empty(width * _TILE, np.float32)
+    scale, one = np.float32(1 / math.sqrt(width)), np.float32(1)
+    for w in range(start.shape[0] - 1):
+        n = start[w + 1] - start[w]
+        padded = (n + 3) // 4 * 4
+        for j in range(padded):
+            rows[j] = np.uintp(order[start[w] + min(j, n - 1)] * heads * width)
+        for _ in range(heads):
+            for at in range(0, n, _TILE):
+                count = min(n - at, _TILE)
+                wide = (count + _VECTOR - 1) // _VECTOR * _VECTOR
+                some = rows[at : at + (count + 3) // 4 * 4]
+                _gather(q, some, width, wide, scale * np.float32(math.log2(math.e)), queries)
+                _gather(grad, some, width, wide, one, outer)
+                _scores(k, rows, queries, weights, padded, width, wide)
+                weights[n * _TILE : padded * _TILE] = np.float32(-1e30)
+                _exponentials(weights, padded, wide, sums)
+                _scores(v, rows, outer, slopes, padded, width, wide)
+                _softmax_slopes(weights, slopes, sums, n, padded, wide)
+                _mix(k, rows, slopes, mixed, padded, width, wide)
+                _add(mixed, some[:count], width, scale, dq)
+                for first in range(0, n, _TILE):
+                    keys = min(n - first, _TILE)
+                    broad = (keys + _VECTOR - 1) // _VECTOR * _VECTOR
+                    others = rows[first : first + keys]
+                    _turn(weights, first, keys, count, turned)
+                    _mix(grad, some, turned, mixed, some.shape[0], width, broad)
+                    _add(mixed, others, width, one, dv)
+                    _turn(slopes, first, keys, count, turned)
+                    _mix(q, some, turned, mixed, some.shape[0], width, broad)
+                    _add(mixed, others, width, scale, dk)
+            for j in range(padded):
+                rows[j] += np.uintp(width)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _softmax_slopes(
+    weights: F32x1, slopes: F32x1, sums: F32x1, n: int, padded: int, wide: int
+) -> None:  # pragma: no cover
+    """weights become probabilities over n keys, slopes (gradients of probabilities) gradients of scores; both 0 beyond."""
+    end = np.uintp(wide)
+    for i in range(end):
+        sums[i], sums[_ROW + i] = np.float32(0), np.float32(1) / sums[_ROW + i]
+    for j in range(n):
+        o = np.uintp(j * _TILE)
+        for i in range(end):
+            weights[o + i] *= sums[_ROW + i]
+            sums[i] += weights[o + i] * slopes[o + i]
+    for j in range(n):
+        o = np.uintp(j * _TILE)
+        for i in range(end):
+            slopes[o + i] = weights[o + i] * (slopes[o + i] - sums[i])
+    weights[n * _TILE : padded * _TILE] = np.float32(0)
+    slopes[n * _TILE : padded * _TILE] = np.float32(0)
+
+
+@njit(cache=True, nogil=True)
+def _turn(x: F32x1, first: int, keys: int, count: int, turned: F32x1) -> None:  # pragma: no cover
+    """turned[i, j] = x[first + j, i] of so many keys j and queries i; 0 for other j and i up to a multiple of four."""
+    turned[: (count + 3) // 4 * 4 * _TILE] = np.float32(0)
+    for j in range(np.uintp(keys)):
+        o = np.uintp((first + j) * _TILE)
+        for i in range(np.uintp(count)):
+            turned[i * _ROW + j] = x[o + i]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _add(columns: F32x1, rows: Uintpx1, width: int, scale: np.float32, out: F32x1) -> None:  # pragma: no cover
+    """out[rows[i] + c] += columns[c, i] * scale."""
+    for i in range(rows.shape[0]):
+        at, to = np.uintp(i), rows[i]
+        for c in range(np.uintp(width)):
+            out[to + c] += columns[at + c * _ROW] * scale

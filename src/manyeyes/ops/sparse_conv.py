@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Sites, SparseBev
+from manyeyes.ops._outer_product_kernels import sum_outer_products
 from manyeyes.ops._sparse_conv_kernels import LANES, convolve, panels
 from manyeyes.ops.sparse_index import (
     NeighbourMap,
@@ -252,6 +253,11 @@ def _in_loops(x: Tensor, taps: Tensor) -> bool:
 def _pair_outer(x: Tensor, dy: Tensor, table: NeighbourMap, reverse: bool) -> Tensor:
     """Return (taps, C, D): for each tap the sum over its pairs of the row of x (N, C), transposed, times the row of dy (M, D)."""
     dw = x.new_zeros(table.window.kernel**2, x.shape[1], dy.shape[1])
+    if _in_loops(x, dw):
+        pairs = table.pairs
+        pairs = Pairs(pairs.target, pairs.source, pairs.counts) if reverse else pairs
+        sum_outer_products(x.contiguous().numpy(), dy.numpy(), pairs, table.is_symmetric, dw.numpy())
+        return dw
     if table.is_symmetric:
         torch.mm(x.T, dy, out=dw[dw.shape[0] // 2])
     longest, blocks = table.blocks(_block_rows(x), reverse)

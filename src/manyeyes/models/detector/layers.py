@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import Sites, SparseBev
+from manyeyes.ops.active_norm import RunningStatistics, norm_relu
 from manyeyes.ops.folded_conv import FoldedConvs, NormedConv, is_supported
 from manyeyes.ops.sparse_conv import inverse_conv, same_sites_map, strided_conv, strided_map, submanifold_conv
 from manyeyes.ops.sparse_index import Window
@@ -28,6 +29,19 @@ class ActiveNorm(nn.BatchNorm1d):
                 input, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps
             )
         return super().forward(input)
+
+    def forward_relu(self, input: Tensor, skip: Tensor | None = None) -> Tensor:
+        """Normalise features (N, C), add skip (N, C) and apply ReLU; input may be overwritten where no gradient needs it."""
+        is_plain = input.device.type == "cpu" and input.dtype == self.weight.dtype == torch.float32
+        if not (self.training and is_plain and input.shape[0] > 1):
+            return _apply_relu(self.forward(input), skip)
+        assert self.running_mean is not None
+        assert self.running_var is not None
+        assert self.num_batches_tracked is not None
+        assert self.momentum is not None
+        self.num_batches_tracked.add_(1)
+        running = RunningStatistics(self.running_mean, self.running_var, self.momentum)
+        return norm_relu(input, skip, self.weight, self.bias, running, self.eps)
 
 
 def fold_norm(weight: Tensor, norm: ActiveNorm) -> tuple[Tensor, Tensor]:
@@ -49,6 +63,11 @@ def conv_weight(outputs: int, inputs: int, kernel: int) -> nn.Parameter:
 def _tap_by_tap(weight: Tensor) -> nn.Parameter:
     """Reorder (outputs, inputs, k, k) in memory to one matrix per tap, so that no call copies it."""
     return nn.Parameter(weight.permute(2, 3, 1, 0).contiguous().permute(3, 2, 0, 1))
+
+
+def _norm_relu(norm: nn.Module, y: Tensor, skip: Tensor | None) -> Tensor:
+    """ReLU of the norm of y plus skip; the caller must own y."""
+    return norm.forward_relu(y, skip) if isinstance(norm, ActiveNorm) else _apply_relu(norm(y), skip)
 
 
 def _apply_relu(y: Tensor, skip: Tensor | None) -> Tensor:
@@ -79,8 +98,8 @@ class SubmanifoldLayer(nn.Module):
         """Map (N, inputs) to (N, outputs) on the same sites."""
         if self.folded is not None and is_supported(x.features):
             return x.with_features(self.folded(x.features, same_sites_map(x.sites, self.weight.shape[2])))
-        y = self.norm(submanifold_conv(x, self.weight, self.bias).features)
-        return x.with_features(_apply_relu(y, x.features if self.skip else None))
+        y = submanifold_conv(x, self.weight, self.bias).features
+        return x.with_features(_norm_relu(self.norm, y, x.features if self.skip else None))
 
     def fold(self) -> None:
         """Fold the norm's running statistics into the weight, and the skip into its centre tap, permanently.
@@ -143,7 +162,7 @@ class DownLayer(nn.Module):
             sites, table = strided_map(x.sites, Window(3, 2, 1), self.dilating)
             return SparseBev(self.folded(x.features, table), sites)
         y = strided_conv(x, self.weight, self.bias, stride=2, padding=1, dilating=self.dilating)
-        return y.with_features(_apply_relu(self.norm(y.features), None))
+        return y.with_features(_norm_relu(self.norm, y.features, None))
 
     def fold(self) -> None:
         """Fold the norm's running statistics into the weight, permanently."""
@@ -170,7 +189,7 @@ class UpLayer(nn.Module):
         """Upsample coarse features to the sites of ``fine``."""
         sites: Sites = fine.sites
         y = inverse_conv(coarse, self.weight, sites, self.bias, stride=2, padding=1)
-        return fine.with_features(torch.relu(self.norm(y.features + self.lateral(fine.features))))
+        return fine.with_features(_norm_relu(self.norm, y.features + self.lateral(fine.features), None))
 
     def fold(self) -> None:
         """Fold the norm's running statistics into both weights, permanently."""

@@ -71,7 +71,7 @@ class MomentPillars(nn.Module):
 
     def encode(self, moments: Tensor) -> Tensor:
         """Encode moments (N, NUM_MOMENTS * sweeps) to (N, channels)."""
-        return torch.relu(self.norm(self.layers(self.scale(moments))))
+        return self.norm.forward_relu(self.layers(self.scale(moments)))
 
 
 class PillarEncoder(nn.Module):

@@ -140,7 +140,7 @@ def density_levels(window: Tensor, cells: int, thresholds: tuple[float, float]) 
 
 def _attend(query: Tensor, key: Tensor, value: Tensor, ids: Tensor) -> Tensor:
     """Attention of (N, heads, C / heads) within windows ids (N,)."""
-    if _plain(query):
+    if query.device.type == "cpu" and query.dtype == torch.float32:
         return attend_in_windows(query, key, value, window_runs(ids))
     return window_attention(query, key, value, plan_windows(ids, ids))
 
