@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from manyeyes.datatypes._point_kernels import move_points
 from manyeyes.datatypes.errors import ShapeError
 from manyeyes.datatypes.numbers import Numbers, as_tensor
 from manyeyes.datatypes.transform import Transform
@@ -71,7 +72,13 @@ class PointCloud:
 
     def transform(self, target_from_source: Transform) -> PointCloud:
         """Return the same returns in another frame."""
-        return PointCloud(target_from_source.apply(self.xyz), self.intensity, self.time_s)
+        xyz, rotation = self.xyz, target_from_source.rotation
+        if rotation.dim() == 2 and xyz.device.type == "cpu" and xyz.dtype == torch.float32 and not xyz.requires_grad:
+            turn, shift = rotation.float().contiguous(), target_from_source.translation.float()
+            moved = torch.from_numpy(move_points(xyz.contiguous().numpy(), turn.numpy(), shift.numpy()))
+        else:
+            moved = target_from_source.apply(xyz)
+        return PointCloud(moved, self.intensity, self.time_s)
 
     @classmethod
     def cat(cls, clouds: list[PointCloud]) -> PointCloud:
