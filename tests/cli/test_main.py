@@ -98,7 +98,7 @@ def test_doctor_prints_json_for_a_bug_report(capsys) -> None:
     import torch
 
     assert output["versions"]["torch"] == torch.__version__ and output["torch_threads"] == torch.get_num_threads()
-    assert {e["name"] for e in output["extras"]} == {"sim", "map", "view", "av2", "dask", "ray", "icp"}
+    assert {e["name"] for e in output["extras"]} == {"sim", "map", "view", "av2", "dask", "ray", "icp", "ros"}
     assert {"cpu", "cores", "system", "git_commit", "weights", "towns", "towns_from", "package"} <= set(output)
 
 

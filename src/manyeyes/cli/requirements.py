@@ -18,6 +18,7 @@ EXTRAS = {
     "dask": ("dask", "distributed"),
     "ray": ("ray",),
     "icp": ("small_gicp",),
+    "ros": ("rosbags",),
 }
 """Modules that each extra installs."""
 

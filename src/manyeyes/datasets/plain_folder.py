@@ -21,14 +21,14 @@ import numpy as np
 import torch
 
 from manyeyes.datasets.base import RecordingReader, require_index
+from manyeyes.datasets.box_table import BoxTable
 from manyeyes.datasets.formats.point_file import SUFFIXES, read_cloud
 from manyeyes.datasets.ground_height import estimate_sensor_height
 from manyeyes.datasets.lidar_frame import make_lidar_frame, merge_listed_boxes, rotation_of_quaternion
 from manyeyes.datasets.missing import FileProblem
-from manyeyes.datasets.object_types import find_label
 from manyeyes.datasets.registry import register_dataset
 from manyeyes.datasets.tables import Table
-from manyeyes.datatypes import AgentFrame, Boxes, RecordingError, Snapshot, Transform
+from manyeyes.datatypes import AgentFrame, RecordingError, Snapshot, Transform
 
 POSES, BOXES, CLOUDS = "poses.csv", "boxes.csv", "clouds"
 MAX_OFFSET_NS = 50_000_000
@@ -59,8 +59,7 @@ def contains_agents(path: Path) -> bool:
 class AgentTable:
     """One agent's rows in the order of time: clouds (N), timestamp_ns (N,), poses of the LiDAR in the world (N, 3, 3), (N, 3).
 
-    speed_mps, height_m: (N,) or None where the table does not have them. boxes: what the agent lists, all times; None without a
-    table; box_time_ns: (M,).
+    speed_mps, height_m: (N,) or None where the table does not have them. boxes: what the agent lists.
     """
 
     id: int
@@ -70,8 +69,8 @@ class AgentTable:
     world_from_lidar: Transform
     speed_mps: np.ndarray | None
     height_m: np.ndarray | None
-    boxes: Boxes | None
-    box_time_ns: np.ndarray
+    boxes: BoxTable
+    has_boxes: bool
 
 
 @register_dataset(
@@ -126,8 +125,8 @@ class FolderRecording(RecordingReader):
         rows = [(agent, row) for agent in agents if (row := _nearest(agent, now)) is not None]
         rows[0] = (agents[0], index)
         frames = tuple(self._frame(agent, row) for agent, row in rows)
-        listed = [_boxes_at(agent, int(agent.timestamp_ns[row])) for agent, row in rows]
-        has_truth = any(agent.boxes is not None for agent in agents)
+        listed = [agent.boxes.at(int(agent.timestamp_ns[row]), agent.id) for agent, row in rows]
+        has_truth = any(agent.has_boxes for agent in agents)
         return Snapshot(scenario, index, frames, merge_listed_boxes(listed, frames) if has_truth else None)
 
     def _of(self, scenario: str) -> tuple[AgentTable, ...]:
@@ -191,7 +190,7 @@ def _read_agent(folder: Path, id: int, scenario: str, problems: list[str], missi
     _check_times(table.path, time[kept])
     poses = _poses(table)
     optional = {n: table.numbers(n)[kept, 0] if n in table.names else None for n in ("speed_mps", "sensor_height_m")}
-    boxes, box_time = _read_boxes(folder / BOXES) if (folder / BOXES).is_file() else (None, np.zeros(0, np.int64))
+    has_boxes = (folder / BOXES).is_file()
     return AgentTable(
         id,
         folder,
@@ -200,8 +199,8 @@ def _read_agent(folder: Path, id: int, scenario: str, problems: list[str], missi
         poses[torch.from_numpy(kept)],
         optional["speed_mps"],
         optional["sensor_height_m"],
-        boxes,
-        box_time,
+        BoxTable.read(folder / BOXES) if has_boxes else BoxTable.empty(),
+        has_boxes,
     )
 
 
@@ -246,34 +245,8 @@ def _poses(table: Table) -> Transform:
     return Transform.from_rpy(place, roll, pitch, yaw)
 
 
-def _read_boxes(path: Path) -> tuple[Boxes, np.ndarray]:
-    """Return the boxes of known types in a table, in the world, and their times (M,)."""
-    table = Table.read(path)
-    table.require("timestamp_ns", "id", "label")
-    time, id = table.integers("timestamp_ns"), table.integers("id")
-    labels = [find_label(text) for text in table.texts("label")]
-    rows = np.array([row for row, label in enumerate(labels) if label is not None], np.int64)
-    values = torch.from_numpy(table.numbers("x", "y", "z", "length", "width", "height", "yaw")[rows])
-    if len(rows) and float(values[:, 3:6].min()) <= 0:
-        raise RecordingError(f"{path}: a box has a size of 0 or below, expected metres; correct it.")
-    velocity = table.numbers("vx", "vy")[rows] if "vx" in table.names else np.zeros((len(rows), 2))
-    label = torch.tensor([label for label in labels if label is not None], dtype=torch.int64)
-    boxes = Boxes.of(
-        values[:, :3], values[:, 3:6], values[:, 6], None, label, torch.from_numpy(id[rows]), torch.from_numpy(velocity)
-    )
-    return boxes, time[rows]
-
-
 def _nearest(agent: AgentTable, timestamp_ns: int) -> int | None:
     """Return the agent's row nearest in time; None where it is farther than MAX_OFFSET_NS."""
     offset = np.abs(agent.timestamp_ns - timestamp_ns)
     row = int(offset.argmin())
     return row if offset[row] <= MAX_OFFSET_NS else None
-
-
-def _boxes_at(agent: AgentTable, timestamp_ns: int) -> Boxes:
-    """Return what the agent lists at one of its sweeps, itself left out."""
-    if agent.boxes is None:
-        return Boxes.empty(torch.float64)
-    here = torch.from_numpy(agent.box_time_ns == timestamp_ns) & (agent.boxes.id != agent.id)
-    return agent.boxes[here]
