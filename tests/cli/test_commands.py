@@ -249,6 +249,27 @@ def test_calibrate_adds_maps_and_keeps_the_weights(data, weights, tmp_path, caps
     assert checkpoint.load(out).score_calibration == after.score_calibration
 
 
+@pytest.mark.slow
+@pytest.mark.training
+def test_finetune_prints_the_holdout_before_and_after(data, weights, tmp_path, capsys) -> None:
+    words = ("--data", data, "--split", "test", "--weights", weights, "--steps", 1, "--out", tmp_path)
+    assert run("finetune", *words, "--validation", data, "--validation-split", "test") == 0
+    output = capsys.readouterr().out
+    assert "4 held out; 1 steps" in output and "after - before" in output and "minutes of CPU time" in output
+    result = json.loads((tmp_path / "finetune.json").read_text())["result"]
+    assert [(row["weights"], row["method"]) for row in result["rows"]] == [
+        (when, method) for when in ("before", "after") for method in ("none", "intermediate")
+    ]
+    tuned = checkpoint.load(tmp_path / "weights.safetensors")
+    assert tuned.codebook is not None and tuned.score_calibration is not None
+    assert checkpoint.read_card(tmp_path / "weights.safetensors")["finetuned_from"] == str(weights)
+
+
+def test_finetune_refuses_a_recording_that_is_too_short_for_a_holdout(data, weights, tmp_path, capsys) -> None:
+    assert run("finetune", "--data", data / "test" / "a", "--weights", weights, "--out", tmp_path) == 1
+    assert "too few for a holdout" in capsys.readouterr().err
+
+
 def test_train_needs_one_weight_a_recording(data, capsys) -> None:
     assert run("train", "--data", data, data, "--data-weights", 1, "--split", "test") == 1
     assert "A mixture of 2 recordings needs 2 positive weights; got [1.0]" in capsys.readouterr().err

@@ -18,6 +18,7 @@ COMMANDS = {
     "demo": "simulate a drive, run every fusion method on it, and write a table, figures, an animation and a report",
     "simulate": "simulate scenes from a seed, in OPV2V's layout",
     "train": "train a detector on recordings: one stage, or all from nothing to what ships",
+    "finetune": "train finished weights on over 20 to 500 labelled frames of your own sensor",
     "fit-codebook": "fit the codebook that quantises the tokens of trained weights",
     "calibrate": "calibrate the scores of trained weights, and with them the score from which boxes are drawn",
     "evaluate": "evaluate methods on a split: AP with intervals, bytes, paired differences",

@@ -76,6 +76,7 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
     "demo": (Requirement("sim", EXTRAS["sim"]), Requirement("view", EXTRAS["view"])),
     "simulate": (_SUMO, _PILLOW.when("cameras", "True"), _PILLOW.when("preset", "*-camera")),
     "train": (_MATPLOTLIB, _SHAPELY.when("preset", "map-*")),
+    "finetune": (),
     "fit-codebook": (),
     "calibrate": (),
     "evaluate": (),

@@ -125,11 +125,23 @@ def fit_codebook(
 
 def with_codebook(detector: Detector, tokens: Tensor, seed: int, config: CodebookConfig) -> Detector:
     """Fit a codebook to shared tokens (N, C + PROPOSAL_DIM) and return the detector with it."""
-    fitted = Detector(replace(detector.config, codebook=config))
     book = Codebook(tokens.shape[1] - PROPOSAL_DIM, config)
     # Rounded to float16 as in the file, so that saving changes nothing.
     book.centres.copy_(fit_centres(tokens[:, :-PROPOSAL_DIM], config, seed).half())
     book.frequencies.copy_(fit_frequencies(book.encode(tokens)))
+    return _attach(detector, book, config)
+
+
+def attach_codebook(detector: Detector, source: Detector) -> Detector:
+    """Return the detector with the codebook of another one with tokens of as many channels, under a new fingerprint."""
+    book, config = source.codebook, source.config.codebook
+    if book is None or config is None:
+        raise ConfigError("The detector that gives its codebook has none; fit one first.")
+    return _attach(detector, book, config)
+
+
+def _attach(detector: Detector, book: Codebook, config: CodebookConfig) -> Detector:
+    fitted = Detector(replace(detector.config, codebook=config))
     weights = {k: v for k, v in detector.state_dict().items() if not k.startswith("codebook.")}
     fitted.load_state_dict(weights | {f"codebook.{k}": v for k, v in book.state_dict().items()})
     fitted.eval().requires_grad_(False)

@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable
 from dataclasses import KW_ONLY, asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch.distributed as dist
 
@@ -19,7 +19,7 @@ from manyeyes.models.detector.detector import Detector, DetectorConfig
 from manyeyes.models.detector.fold_norms import fold_norms
 from manyeyes.models.score_calibration import CARD_KEY as SCORE_KEY
 from manyeyes.models.token_peaks import CARD_KEY
-from manyeyes.training.detector.codebook import fit_codebook
+from manyeyes.training.detector.codebook import attach_codebook, fit_codebook
 from manyeyes.training.detector.score_calibration import calibrate_detector
 from manyeyes.training.detector.task import DetectorTask, DetectorTrainConfig
 from manyeyes.training.trainer import Progress, Trainer
@@ -37,7 +37,8 @@ class TrainPlan:
         stages: name and settings of each stage; stage k is trained with the seed of the plan plus k.
         released: configuration of the weights that ship, with tensors of the same shapes; None for that of the last stage.
         start: shipped weights that the first stage begins from where none are given; None for random ones.
-        codebook: settings of the codebook that is fitted after the last stage; None for no codebook.
+        codebook: settings of the codebook that is fitted after the last stage; "start" for that of the initial weights; None for no
+            codebook.
         codebook_frames: maximum number of evaluated frames that the codebook is fitted to, spread evenly.
         calibration_frames: maximum number of evaluated frames of validation that scores are calibrated on, spread evenly.
     """
@@ -46,7 +47,7 @@ class TrainPlan:
     _: KW_ONLY
     released: DetectorConfig | None = None
     start: str | None = None
-    codebook: CodebookConfig | None = CodebookConfig()
+    codebook: CodebookConfig | Literal["start"] | None = CodebookConfig()
     codebook_frames: int = 400
     calibration_frames: int = 300
 
@@ -142,7 +143,8 @@ class PlanRun:
         seed = self.seed + len(plan.stages)
         trained = checkpoint.load(weights)
         source = trained.fingerprint.hex()
-        config = replace(plan.released or trained.config, codebook=plan.codebook)
+        given = self._load_start() if plan.codebook == "start" else None
+        config = replace(plan.released or trained.config, codebook=self._codebook_config(given))
         if path.exists():
             fitted = checkpoint.read_card(path).get("codebook", {})
             if (fitted.get("seed"), fitted.get("started_from")) == (seed, source) and checkpoint.load(
@@ -155,7 +157,9 @@ class PlanRun:
             nonlocal tokens
             tokens = number
 
-        if plan.codebook is not None:
+        if given is not None:
+            detector = attach_codebook(detector, given)
+        elif isinstance(plan.codebook, CodebookConfig):
             frames = sum(1 for _ in iter_eval_frames(self.recording))
             stride = max(1, frames // plan.codebook_frames)
             detector = fit_codebook(detector, self.recording, seed, plan.codebook, stride, count)
@@ -163,6 +167,23 @@ class PlanRun:
         peaks = checkpoint.read_card(weights)[CARD_KEY]
         checkpoint.save(detector, path, {**card, CARD_KEY: peaks, "codebook": about}, half=True)
         return path
+
+    def _codebook_config(self, given: Detector | None) -> CodebookConfig | None:
+        """Return the settings of the final codebook; given: the initial detector, where its codebook is kept."""
+        if given is not None:
+            return given.config.codebook
+        return self.plan.codebook if isinstance(self.plan.codebook, CodebookConfig) else None
+
+    def _load_start(self) -> Detector:
+        """Return the initial detector, whose codebook is kept.
+
+        Raises:
+            ConfigError: there are none, or they have no codebook.
+        """
+        initial = None if self.start is None else checkpoint.load(self.start)
+        if initial is None or initial.codebook is None:
+            raise ConfigError("The initial weights have no codebook that could be kept; fit one instead.")
+        return initial
 
     def _calibrate(self, weights: Path) -> Path:
         """Write the weights with calibrated scores, where there is a recording of validation; returns the file."""
