@@ -16,27 +16,19 @@ python benchmarks/receiver.py [--baseline COMMIT or FOLDER] [--instants 40] [--a
 from __future__ import annotations
 
 import argparse
-import os
 import shlex
-import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import torch
+from versions import ROOT, Version as Checkout, checkout, use_own_cache
 
-# Both versions are compiled in this process: code that numba has cached in others may have symbols of one name in both.
-CACHE = tempfile.TemporaryDirectory()
-os.environ["NUMBA_CACHE_DIR"] = CACHE.name
-
-ROOT = Path(__file__).resolve().parents[1]
+CACHE = use_own_cache()
 sys.path[:0] = [str(ROOT), str(ROOT / "src")]
 
 from street import street  # noqa: E402
@@ -56,30 +48,10 @@ WARMUP = 3
 
 
 @dataclass
-class Version:
-    """One checkout of the package, with its own modules, apart from the one that sets how numba compiles in this process.
+class Version(Checkout):
+    """One checkout of the package. agents: by strategy; they keep their histories."""
 
-    agents: by strategy; they keep their histories.
-    """
-
-    source: Path
-    modules: dict[str, ModuleType] = field(default_factory=lambda: {"manyeyes._jit": sys.modules["manyeyes._jit"]})
     agents: dict[str, list[Any]] = field(default_factory=dict)
-
-    @contextmanager
-    def active(self) -> Iterator[None]:
-        """Make this version the package ``manyeyes`` of the process."""
-        others = {name: sys.modules.pop(name) for name in list(sys.modules) if name.split(".")[0] == "manyeyes"}
-        sys.modules.update(self.modules)
-        sys.path.insert(0, str(self.source))
-        try:
-            yield
-        finally:
-            sys.path.remove(str(self.source))
-            self.modules = {
-                name: sys.modules.pop(name) for name in list(sys.modules) if name.split(".")[0] == "manyeyes"
-            }
-            sys.modules.update(others)
 
     def start(self) -> None:
         """Load the shipped weights, and make the agents."""
@@ -131,21 +103,6 @@ class Difference:
     high: float
     instants: int
     equal_boxes: int
-
-
-@contextmanager
-def checkout(baseline: str) -> Iterator[Path]:
-    """Yield the folder of a commit, or a folder itself, whose compiled loops are then kept."""
-    if Path(baseline).is_dir():
-        yield Path(baseline).resolve()
-        return
-    with tempfile.TemporaryDirectory() as name:
-        code = Path(name) / "code"
-        subprocess.run(["git", "worktree", "add", "--detach", str(code), baseline], check=True, cwd=ROOT)
-        try:
-            yield code
-        finally:
-            subprocess.run(["git", "worktree", "remove", "--force", str(code)], check=False, cwd=ROOT)
 
 
 def compare(baseline: Version, present: Version, seen: Sequence[AgentFrame], instants: int) -> list[Difference]:
