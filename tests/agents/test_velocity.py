@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from manyeyes.agents.velocity import MIN_LATERAL_SEARCH_MPS, PastDetections, VelocityConfig, estimate_velocities
+from manyeyes.agents.velocity import PastDetections, VelocityConfig, estimate_velocities
 from manyeyes.datatypes import Boxes, Transform
 
 CONFIG = VelocityConfig()
@@ -156,20 +156,6 @@ def test_points_correct_a_wrong_longitudinal_speed(speed: float) -> None:
     by_points = float(estimate_velocities(now, earlier, CONFIG, body(0.0))[0, 0])
     assert by_boxes > speed + 0.8
     assert by_points == pytest.approx(speed, abs=0.5)
-
-
-@pytest.mark.parametrize("aside", (-0.35, 0.35))
-def test_points_correct_an_unobserved_lateral_velocity(aside: float) -> None:
-    """Boxes and headings move straight ahead, points do not. Below MIN_LATERAL_SEARCH_MPS there is no lateral search."""
-    for speed in (8.0, 0.8):
-        now, earlier = cars([(0.0, 0.0)]), drive((speed, 0), 5)
-        for k in (1, 2):
-            t = earlier[k].age_s
-            there = body(-speed * t) - torch.tensor([0.0, aside * t, 0.0])
-            earlier[k] = replace(earlier[k], points=there)
-        got = estimate_velocities(now, earlier, CONFIG, body(0.0))[0]
-        assert float(got[0]) == pytest.approx(speed, abs=0.3)
-        assert float(got[1]) == pytest.approx(aside if speed > MIN_LATERAL_SEARCH_MPS else 0.0, abs=0.15)
 
 
 def test_without_points_velocities_follow_from_boxes() -> None:

@@ -78,6 +78,18 @@ def test_costs_are_those_of_every_pair_of_points() -> None:
     assert MAX_POINTS in count.tolist()
 
 
+def test_points_beyond_the_index_count() -> None:
+    """Boxes far out and across the border of the index, which its outermost cells hold."""
+    for x, y in ((127.5, -127.0), (-400.0, 3.0), (2.0, 260.0)):
+        shift = torch.tensor([x, y, 0.0])
+        now, then = scattered(2) + shift, scattered(3, 900) + shift
+        boxes, back, slack = cars([(x, y)], 1.1), torch.tensor([[1.0, 0.3]]), torch.tensor([0.8])
+        cost, count = compute_alignment_costs(now, then, boxes, back, slack, STEPS)
+        want, asked = plain(now, then, boxes, back[0].double(), 0.8)
+        np.testing.assert_allclose(cost[0].numpy(), want, atol=1e-4)
+        assert int(count[0]) == asked >= MIN_POINTS
+
+
 def test_the_cost_is_zero_at_the_true_motion() -> None:
     """0.6 m farther back than estimated, along its length and not the frame's axis; the road under it does not count."""
     yaw = 0.7

@@ -21,10 +21,6 @@ from manyeyes.ops.point_alignment_cost import MAX_POINTS, compute_alignment_cost
 
 LONGITUDINAL_SIGMAS = torch.linspace(-3.0, 3.0, 31)
 """Longitudinal search offsets, in standard deviations of the line fit."""
-LATERAL_SIGMAS = torch.tensor([-2.0, -4 / 3, -2 / 3, 2 / 3, 4 / 3, 2.0])
-"""Lateral search offsets, likewise: a heading error of a few degrees gives a lateral velocity."""
-MIN_LATERAL_SEARCH_MPS = 1.0
-"""Minimum speed of a box for the lateral search."""
 
 
 @dataclass(frozen=True)
@@ -97,38 +93,18 @@ def _match_points(
     config: VelocityConfig,
 ) -> Tensor:
     """Return velocities (N, 2) of minimum alignment cost around the given ones; information: as in _LineFit."""
-    velocity_covariance = torch.linalg.inv(information)
     longitudinal = torch.stack((boxes.yaw.cos(), boxes.yaw.sin()), 1)
-    lateral = torch.stack((-longitudinal[:, 1], longitudinal[:, 0]), 1)
-    sigma_longitudinal, sigma_lateral = (
-        (axis[:, None] @ velocity_covariance @ axis[:, :, None])[:, 0, 0].sqrt() for axis in (longitudinal, lateral)
-    )
-    sigma_longitudinal = sigma_longitudinal.clamp_max(config.sigma_detected_velocity_mps)
-
-    def search(rows: Tensor, lateral_sigmas: float) -> tuple[Tensor, Tensor]:
-        """Minimum cost and its velocity of some boxes at one lateral offset."""
-        subset, start = boxes[rows], velocity[rows] + lateral_sigmas * sigma_lateral[rows, None] * lateral[rows]
-        cost = (LONGITUDINAL_SIGMAS**2 + lateral_sigmas**2).to(start.dtype).expand(len(subset), -1)
-        for then in past:
-            if then.points is not None:
-                t = then.age_s
-                slack = LONGITUDINAL_SIGMAS[-1] * sigma_longitudinal[rows] * t
-                missed, num_compared = compute_alignment_costs(
-                    points, then.points, subset, start * t, slack, len(LONGITUDINAL_SIGMAS)
-                )
-                cost = cost + config.point_match_weight * (num_compared / MAX_POINTS)[:, None] * missed
-        min_cost, at = cost.min(1)
-        return min_cost, start + (sigma_longitudinal[rows] * LONGITUDINAL_SIGMAS[at])[:, None] * longitudinal[rows]
-
-    min_cost, found = search(torch.arange(len(boxes)), 0.0)
-    drives = (found.norm(dim=1) > MIN_LATERAL_SEARCH_MPS).nonzero()[:, 0]
-    if len(drives):
-        cost, other = zip(
-            (min_cost[drives], found[drives]),
-            *(search(drives, float(lateral_sigmas)) for lateral_sigmas in LATERAL_SIGMAS),
-        )
-        found[drives] = torch.stack(other)[torch.stack(cost).argmin(0), torch.arange(len(drives))]
-    return found
+    variance = (longitudinal[:, None] @ torch.linalg.inv(information) @ longitudinal[:, :, None])[:, 0, 0]
+    sigma = variance.sqrt().clamp_max(config.sigma_detected_velocity_mps)
+    cost = (LONGITUDINAL_SIGMAS**2).to(velocity.dtype).expand(len(boxes), -1)
+    for then in past:
+        if then.points is not None:
+            t = then.age_s
+            missed, num_compared = compute_alignment_costs(
+                points, then.points, boxes, velocity * t, LONGITUDINAL_SIGMAS[-1] * sigma * t, len(LONGITUDINAL_SIGMAS)
+            )
+            cost = cost + config.point_match_weight * (num_compared / MAX_POINTS)[:, None] * missed
+    return velocity + (sigma * LONGITUDINAL_SIGMAS[cost.argmin(1)])[:, None] * longitudinal
 
 
 @dataclass(frozen=True)

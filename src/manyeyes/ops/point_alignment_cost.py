@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from manyeyes._jit import F32x2, F64x1, F64x2, I64x1, njit
+from manyeyes._jit import F32x2, F64x1, F64x2, I32x1, I64x1, njit
 from manyeyes.datatypes import Boxes
 
 MAX_DISTANCE_M = 0.4
@@ -26,6 +26,9 @@ ROAD_CLEARANCE_M = 0.25
 """Points nearer to the bottom of a box are the road's."""
 HEIGHT_SCALE = 0.5
 """Height counts so much: rings of a LiDAR meet a body at other heights as it drives away."""
+_CELL_M = 2.0
+_CELLS = 128
+"""Number of cells on each axis of the index of points, which is centred at the origin; border cells hold all points beyond."""
 
 
 def compute_alignment_costs(
@@ -58,29 +61,71 @@ class _Box(NamedTuple):
     half_height: float
 
 
+class _PointCells(NamedTuple):
+    """Points (P, 3) by cells of the ground: rows start[c] to start[c + 1] of order are those of cell c, ascending."""
+
+    points: F32x2
+    start: I32x1
+    order: I32x1
+
+
+@njit(cache=True, nogil=True)
+def _cell_at(metres: float) -> int:  # pragma: no cover
+    """Return the row or column of a coordinate; NaN is in the first."""
+    at = np.floor(metres / _CELL_M) + _CELLS // 2
+    return int(min(at, _CELLS - 1.0)) if at > 0.0 else 0
+
+
+@njit(cache=True, nogil=True)
+def _index_points(points: F32x2) -> _PointCells:  # pragma: no cover
+    """Sort points (P, 3) by cells (counting sort)."""
+    cell, start = np.empty(len(points), np.int32), np.zeros(_CELLS * _CELLS + 1, np.int32)
+    for p in range(len(points)):
+        cell[p] = _cell_at(points[p, 1]) * _CELLS + _cell_at(points[p, 0])
+        start[cell[p] + 1] += 1
+    for c in range(_CELLS * _CELLS):
+        start[c + 1] += start[c]
+    order, filled = np.empty(len(points), np.int32), start[:-1].copy()
+    for p in range(len(points)):
+        order[filled[cell[p]]] = p
+        filled[cell[p]] += 1
+    return _PointCells(points, start, order)
+
+
 @njit(cache=True, nogil=True)
 def _inside(
-    points: F32x2, place: _Box, away_x: float, away_y: float, longitudinal_margin: float
+    cells: _PointCells, place: _Box, away_x: float, away_y: float, longitudinal_margin: float
 ) -> F64x2:  # pragma: no cover
-    """Return (K, 3): points in a box moved by away and made longer at each end, from its middle, in its axes, heights scaled."""
+    """Return (K, 3): points in a box moved by away and made longer at each end, from its middle, in its axes, heights scaled.
+
+    They are in the order of the cloud.
+    """
+    points, start, order = cells
     x0, y0 = place.x + away_x, place.y + away_y
     length, width, height = (
         place.half_length + longitudinal_margin,
         place.half_width + BOX_MARGIN_M[1],
         place.half_height,
     )
-    radius = (length * length + width * width) ** 0.5
-    found, count = np.empty((len(points), 3)), 0
-    for p in range(len(points)):
-        x, y = points[p, 0] - x0, points[p, 1] - y0
-        if abs(x) > radius or abs(y) > radius:
-            continue
-        u, v = x * place.cos_yaw + y * place.sin_yaw, y * place.cos_yaw - x * place.sin_yaw
-        z = points[p, 2] - place.z
-        if abs(u) < length and abs(v) < width and ROAD_CLEARANCE_M - height < z < height + BOX_MARGIN_M[2]:
-            found[count, 0], found[count, 1], found[count, 2] = u, v, HEIGHT_SCALE * z
-            count += 1
-    return found[:count]
+    reach_x = length * abs(place.cos_yaw) + width * abs(place.sin_yaw)
+    reach_y = length * abs(place.sin_yaw) + width * abs(place.cos_yaw)
+    first, last = _cell_at(x0 - reach_x), _cell_at(x0 + reach_x)
+    rows = np.empty(len(points), np.int32)
+    count = 0
+    for row in range(_cell_at(y0 - reach_y), _cell_at(y0 + reach_y) + 1):
+        for k in range(start[row * _CELLS + first], start[row * _CELLS + last + 1]):
+            p = order[k]
+            x, y, z = points[p, 0] - x0, points[p, 1] - y0, points[p, 2] - place.z
+            u, v = x * place.cos_yaw + y * place.sin_yaw, y * place.cos_yaw - x * place.sin_yaw
+            if abs(u) < length and abs(v) < width and ROAD_CLEARANCE_M - height < z < height + BOX_MARGIN_M[2]:
+                rows[count] = p
+                count += 1
+    found, kept = np.empty((count, 3)), np.sort(rows[:count])
+    for k in range(count):
+        x, y, z = points[kept[k], 0] - x0, points[kept[k], 1] - y0, points[kept[k], 2] - place.z
+        found[k, 0], found[k, 1] = x * place.cos_yaw + y * place.sin_yaw, y * place.cos_yaw - x * place.sin_yaw
+        found[k, 2] = HEIGHT_SCALE * z
+    return found
 
 
 @njit(cache=True, nogil=True)
@@ -90,11 +135,12 @@ def _match(
     """Fills cost (N, S) and count (N,); places (N, 8): the fields of a :class:`_Box`."""
     steps, limit = cost.shape[1], MAX_DISTANCE_M * MAX_DISTANCE_M
     x, best = np.empty(steps), np.empty(steps)
+    cells_now, cells_then = _index_points(now), _index_points(then)
     for n in range(len(places)):
         p = places[n]
         box = _Box(p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7])
-        mine = _inside(now, box, 0.0, 0.0, BOX_MARGIN_M[0])
-        theirs = _inside(then, box, -back[n, 0], -back[n, 1], BOX_MARGIN_M[0] + slack[n])
+        mine = _inside(cells_now, box, 0.0, 0.0, BOX_MARGIN_M[0])
+        theirs = _inside(cells_then, box, -back[n, 0], -back[n, 1], BOX_MARGIN_M[0] + slack[n])
         if len(mine) < MIN_POINTS or len(theirs) < MIN_POINTS:
             continue
         asked = min(len(mine), MAX_POINTS)
