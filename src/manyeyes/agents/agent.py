@@ -37,7 +37,7 @@ from manyeyes.comms import wire
 from manyeyes.comms.agent_body import count_agent_body_bytes
 from manyeyes.comms.inbox import Inbox, ReceivedMessage, Rejection
 from manyeyes.comms.receiver_limits import ReceiverLimits
-from manyeyes.comms.token_selection import select_within_budget
+from manyeyes.comms.token_selection import SelectedTokens, select_for_packets
 from manyeyes.comms.wire import TokenEncoding
 from manyeyes.datatypes import AgentFrame, Boxes, Message, SparseBev
 from manyeyes.models.detector.protocols import BoxDetector, check_detector, require_tokens
@@ -137,8 +137,11 @@ class Agent:
         if message.tokens is None:
             return wire.make_packets(message, bodies)
         left = None if budget is None else budget - wire.count_bytes(bodies, message.body)
-        kept, encoded = self._select(message, message.tokens, left)
-        bodies += wire.encode_tokens(encoded, token_encoding=self.token_encoding, tables=self.token_format.tables)
+        kept, selected = self._select(message, message.tokens, left)
+        encoded = replace(message, tokens=selected.tokens, token_score=selected.score)
+        bodies += wire.encode_tokens(
+            encoded, token_encoding=self.token_encoding, tables=self.token_format.tables, counts=selected.counts
+        )
         packets = wire.make_packets(message, bodies)
         self.strategy.record_sent(self.perception_cache, frame, kept)
         return [] if budget is not None and sum(map(len, packets)) > budget else packets
@@ -157,16 +160,17 @@ class Agent:
             message = replace(message, request=make_request_map(self.perception_cache, frame))
         return message
 
-    def _select(self, message: Message, tokens: SparseBev, budget_bytes: int | None) -> tuple[Message, Message]:
-        """Return the message with the tokens that fit into a budget, as the detector made them, and as they are encoded."""
+    def _select(self, message: Message, tokens: SparseBev, budget_bytes: int | None) -> tuple[Message, SelectedTokens]:
+        """Return the message with the tokens that fit into a budget, as the detector made them, and them as they are encoded."""
         tokens = tokens.with_features(self.token_format.clamp(tokens.features))
         is_coded, tables = self.token_encoding == "codebook", self.token_format.tables
         encoded = quantise_tokens(tokens, self.perception_cache.detector) if is_coded else tokens
         score = torch.ones(len(tokens.sites)) if message.token_score is None else message.token_score
         mtu = wire.DEFAULT_MTU - count_agent_body_bytes(message.body)
-        encoded, score = select_within_budget(encoded, score, budget_bytes, self.token_encoding, mtu, tables)
-        kept = tokens.keep(torch.isin(tokens.sites.key, encoded.sites.key))
-        return replace(message, tokens=kept, token_score=score), replace(message, tokens=encoded, token_score=score)
+        selected = select_for_packets(encoded, score, budget_bytes, self.token_encoding, mtu, tables)
+        if selected.tokens is not encoded:
+            tokens = tokens.keep(torch.isin(tokens.sites.key, selected.tokens.sites.key))
+        return replace(message, tokens=tokens, token_score=selected.score), selected
 
     def inbox(self, expire_ns: int | None = None) -> Inbox:
         """Return an inbox that accepts only tokens that this agent can fuse."""

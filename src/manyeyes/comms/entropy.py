@@ -30,6 +30,13 @@ MAX_CODED_CELLS = 1 << 18
 """Of a grid whose cells are coded: a forged packet costs its reader milliseconds, not more."""
 
 _CONTEXTS = 16
+_BIT = 1 << 16
+_BITS: NDArray[np.int64] = np.rint((TOTAL_BITS - np.log2(np.maximum(np.arange(TOTAL + 1), 1))) * _BIT).astype(np.int64)
+"""(TOTAL + 1,) information content of a symbol of each frequency, in 2^-16 bits."""
+_CELL_BITS = 5
+"""Information content of a named cell from which the search for a body's number of cells starts."""
+_SLACK_BITS = 32
+"""A stream is longer or shorter than its information content by less than this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,32 +136,130 @@ def _counts(
     key: I64x1, rows: U8x2, height: int, width: int, tables: _ByteTables, limits: _BodyLimits
 ) -> I64x1:  # pragma: no cover
     fixed, capacity, header, left = limits
-    counts, bodies, at = np.empty(key.shape[0], np.int64), 0, 0
-    top = 0
+    counts, bodies, at, top = np.empty(key.shape[0], np.int64), 0, 0, 0
     for k in key:
         top = max(top, k)
-    symbols = np.empty((top + 1 + rows.size, 2), np.int32)
+    symbols, ends = np.empty((top + 1 + rows.size, 2), np.int32), _row_ends(rows, tables)
+    order = _Order(key, rows, ends, height, width)
     while at < key.shape[0]:
         room = max(0, (capacity if left < 0 else min(capacity, left - header)) - fixed)
-        # The bounds do not depend on the room: with more of it the search never ends lower, so budgets are nested.
-        low, high, taken = 0, min(key.shape[0] - at, 65535), 0
-        while low < high:
-            middle = (low + high + 1) // 2
-            order = np.argsort(key[at : at + middle]) + at
-            used = _symbols(key[order], rows[order], height, width, tables, symbols)
-            size = _size(symbols[:used])
-            if size <= room:
-                low, taken = middle, size
-            else:
-                high = middle - 1
-        if low == 0:
+        count = _search(order, at, room, _guess(ends, at, capacity - fixed))
+        # The nearest count whose stream fits: with more room, no step ends lower, so that budgets are nested.
+        taken = _stream_size(order, at, count, room, tables, symbols)
+        while count and taken < 0:
+            count -= 1
+            taken = _stream_size(order, at, count, room, tables, symbols)
+        while True:
+            longer = _stream_size(order, at, count + 1, room, tables, symbols)
+            if longer < 0:
+                break
+            count, taken = count + 1, longer
+        if count == 0:
             break
         if left >= 0:
             left -= header + fixed + taken
-        counts[bodies] = low
+        counts[bodies] = count
         bodies += 1
-        at += low
+        at += count
     return counts[:bodies]
+
+
+class _Order(NamedTuple):
+    """Cells in the order in which they are sent: key (N,), rows (N, W), ends (N + 1,) of :func:`_row_ends`, and the grid."""
+
+    key: I64x1
+    rows: U8x2
+    ends: I64x1
+    height: int
+    width: int
+
+
+@njit(cache=True)
+def _row_ends(rows: U8x2, tables: _ByteTables) -> I64x1:  # pragma: no cover
+    """Return (N + 1,) the information content of the first rows, in 2^-16 bits."""
+    ends = np.zeros(rows.shape[0] + 1, np.int64)
+    for i in range(rows.shape[0]):
+        bits = np.int64(0)
+        for j in range(rows.shape[1]):
+            bits += _BITS[tables.frequencies[j, rows[i, j]]]
+        ends[i + 1] = ends[i] + bits
+    return ends
+
+
+@njit(cache=True)
+def _guess(ends: I64x1, at: int, room: int) -> int:  # pragma: no cover
+    """Return about how many rows from at on fill so many bytes, at least 1."""
+    limit, count = 8 * (room - STATE_BYTES) * _BIT, 1
+    while at + count + 1 < ends.shape[0] and ends[at + count + 1] - ends[at] + (count + 1) * _CELL_BITS * _BIT <= limit:
+        count += 1
+    return count
+
+
+@njit(cache=True)
+def _search(order: _Order, at: int, room: int, start: int) -> int:  # pragma: no cover
+    """Return a number of cells from at on whose information content fits the room, while that of one more does not.
+
+    The counts are tried from start on, by steps that double and then halve. They do not depend on the room: with more of it the
+    search never ends lower.
+    """
+    limit, step, low = 8 * (room - STATE_BYTES) * _BIT, 1, 0
+    if _bits(order, at, start) <= limit:
+        low, high = start, start + 1
+        while _bits(order, at, high) <= limit:
+            low, step = high, 2 * step
+            high += step
+    else:
+        high, low = start, max(start - 1, 0)
+        while low and _bits(order, at, low) > limit:
+            high, step = low, 2 * step
+            low = max(low - step, 0)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if _bits(order, at, middle) <= limit:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@njit(cache=True)
+def _bits(order: _Order, at: int, count: int) -> int:  # pragma: no cover
+    """Return the information content of so many cells from at on, in 2^-16 bits; more than any room where there are fewer."""
+    if count > min(order.key.shape[0] - at, 65535):
+        return 1 << 62
+    key = np.sort(order.key[at : at + count])
+    named, counts = np.zeros(key[-1] + 1, np.bool_), _prior(count, order.height * order.width)
+    bits, found, row, column = order.ends[at + count] - order.ends[at], 0, 0, 0
+    for k in range(key[-1] + 1):
+        context = _context(named, k, row, column, order.height, order.width)
+        chance = _cell_frequency(counts, context)
+        if k == key[found]:
+            named[k] = True
+            found += 1
+            bits += _BITS[chance]
+            counts[context, 1] += 2
+        else:
+            bits += _BITS[TOTAL - chance]
+            counts[context, 0] += 2
+        column += 1
+        if column == order.width:
+            row, column = row + 1, 0
+    return bits
+
+
+@njit(cache=True)
+def _stream_size(
+    order: _Order, at: int, count: int, room: int, tables: _ByteTables, symbols: I32x2
+) -> int:  # pragma: no cover
+    """Return bytes of the stream of so many cells from at on; -1 where it does not fit the room."""
+    if count == 0:
+        return 0
+    if _bits(order, at, count) > (8 * (room - STATE_BYTES) + _SLACK_BITS) * _BIT:
+        return -1
+    chosen = np.argsort(order.key[at : at + count]) + at
+    used = _symbols(order.key[chosen], order.rows[chosen], order.height, order.width, tables, symbols)
+    size = _size(symbols[:used])
+    return size if size <= room else -1
 
 
 @njit(cache=True)

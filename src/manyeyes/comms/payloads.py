@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -275,8 +276,17 @@ def _grid_and_cells(fields: tuple[int, ...]) -> tuple[BevGrid, int]:
     return grid, rows * columns
 
 
-def pack_token_bodies(tokens: SparseBev, score: Tensor | None, token_codec: TokenCodec, capacity: int) -> list[bytes]:
-    """Return the bodies of the tokens packets, the cells of highest score in the first."""
+def pack_token_bodies(
+    tokens: SparseBev,
+    score: Tensor | None,
+    token_codec: TokenCodec,
+    capacity: int,
+    counts: Sequence[int] | None = None,
+) -> list[bytes]:
+    """Return the bodies of the tokens packets, the cells of highest score in the first.
+
+    counts: the result of :func:`count_cells_per_packet` for these tokens, if it is known.
+    """
     order = token_order(tokens, score)
     key, encoding = tokens.sites.key.cpu().numpy()[order], token_codec.encoding
     features = tokens.features.detach().cpu()
@@ -287,7 +297,9 @@ def pack_token_bodies(tokens: SparseBev, score: Tensor | None, token_codec: Toke
     if not (math.isfinite(peak) and peak <= largest):
         raise WireError(f"Features sent as {encoding} must be finite and at most {largest:g}; these are not.")
     grid, channels = _GRID.pack(*_grid_fields(tokens.grid)), features.shape[1]
-    counts = count_cells_per_packet(tokens, order, token_codec, capacity) or [0]
+    if counts is None:
+        counts = count_cells_per_packet(tokens, order, token_codec, capacity)
+    counts = list(counts) or [0]
     # All bodies at once, each with its cells in ascending order.
     inner = np.argsort(np.repeat(np.arange(len(counts)) * _MAX_CELLS, counts) + key)
     key, features = key[inner], features.index_select(0, torch.from_numpy(order[inner]))

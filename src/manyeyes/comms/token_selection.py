@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -10,6 +12,41 @@ from manyeyes.comms.entropy import CodeTables
 from manyeyes.comms.payloads import TokenCodec, TokenEncoding, count_cells_per_packet, token_order
 from manyeyes.comms.wire import DEFAULT_MTU, HEADER_BYTES
 from manyeyes.datatypes import SparseBev
+
+
+@dataclass(frozen=True, eq=False)
+class SelectedTokens:
+    """tokens: the cells to send; score: (N,) of them; counts: how many of them each packet takes, in the order of their score."""
+
+    tokens: SparseBev
+    score: Tensor
+    counts: tuple[int, ...]
+
+
+def select_for_packets(
+    bev: SparseBev,
+    score: Tensor,
+    budget_bytes: int | None,
+    token_encoding: TokenEncoding = "float16",
+    mtu: int = DEFAULT_MTU,
+    tables: CodeTables | None = None,
+) -> SelectedTokens:
+    """Return the cells of highest score (N,), ties by key, whose packets together have at most budget_bytes; None is no limit.
+
+    Header, cell indices, scales and checksums are counted, so that the packets that ``wire.encode_tokens`` makes of the result
+    never exceed the budget. A smaller budget keeps a subset. A budget that holds no cell keeps none: then the section is left
+    out of the message (an empty section would still cost its header). Source: CoSTr Eq. 13 with real bytes.
+    """
+    token_codec = TokenCodec(token_encoding, tables)
+    order = token_order(bev, score)
+    counts = count_cells_per_packet(bev, order, token_codec, mtu - HEADER_BYTES, HEADER_BYTES, budget_bytes)
+    kept = sum(counts)
+    if kept == len(order):
+        return SelectedTokens(bev, score, tuple(counts))
+    mask = torch.zeros(len(order), dtype=torch.bool)
+    mask[torch.from_numpy(order[:kept])] = True
+    mask = mask.to(score.device)
+    return SelectedTokens(bev.keep(mask), score[mask], tuple(counts))
 
 
 def select_within_budget(
@@ -20,18 +57,6 @@ def select_within_budget(
     mtu: int = DEFAULT_MTU,
     tables: CodeTables | None = None,
 ) -> tuple[SparseBev, Tensor]:
-    """Return the cells of highest score (N,), ties by key, whose packets together have at most budget_bytes; None is no limit.
-
-    Header, cell indices, scales and checksums are counted, so that the packets ``wire.encode`` makes of the result
-    never exceed the budget. A smaller budget keeps a subset. A budget that holds no cell keeps none: then the section
-    is left out of the message (an empty section would still cost its header). Source: CoSTr Eq. 13 with real bytes.
-    """
-    token_codec = TokenCodec(token_encoding, tables)
-    order = token_order(bev, score)
-    if budget_bytes is None:
-        return bev, score
-    kept = sum(count_cells_per_packet(bev, order, token_codec, mtu - HEADER_BYTES, HEADER_BYTES, budget_bytes))
-    mask = torch.zeros(len(order), dtype=torch.bool)
-    mask[torch.from_numpy(order[:kept])] = True
-    mask = mask.to(score.device)
-    return bev.keep(mask), score[mask]
+    """Return the tokens and scores of :func:`select_for_packets`."""
+    selected = select_for_packets(bev, score, budget_bytes, token_encoding, mtu, tables)
+    return selected.tokens, selected.score

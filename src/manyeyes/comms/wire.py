@@ -209,8 +209,12 @@ def encode_tokens(
     token_encoding: TokenEncoding = "float16",
     mtu: int = DEFAULT_MTU,
     tables: CodeTables | None = None,
+    counts: Sequence[int] | None = None,
 ) -> list[EncodedBody]:
-    """Return the tokens of a message as the bodies of packets, none without tokens; arguments and errors as in :func:`encode`."""
+    """Return the tokens of a message as the bodies of packets, none without tokens; arguments and errors as in :func:`encode`.
+
+    counts: how many tokens each packet takes, where ``token_selection.select_for_packets`` has counted them.
+    """
     token_codec, capacity = TokenCodec(token_encoding, tables), _body_capacity(mtu, message)
     if message.tokens is None:
         return []
@@ -218,7 +222,7 @@ def encode_tokens(
         raise WireError(
             f"Tables of weights {tables.fingerprint.hex()} do not code tokens of {message.fingerprint.hex()}."
         )
-    rows = payloads.pack_token_bodies(message.tokens, message.token_score, token_codec, capacity)
+    rows = payloads.pack_token_bodies(message.tokens, message.token_score, token_codec, capacity, counts)
     return [EncodedBody(payloads.TOKENS, content) for content in rows]
 
 
