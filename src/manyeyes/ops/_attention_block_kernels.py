@@ -69,7 +69,10 @@ class BlockWeights:
         """Return copies of the weights of six layers and two norms; None where the loops do not know such."""
         if any(n.eps != _EPS for n in norms) or any(w.out_features % LANES or w.weight.is_cuda for w in linears):
             return None
-        tensors = [*(w.bias for w in linears), *(t for n in norms for t in (n.weight, n.bias))]
+        tensors = [
+            *(torch.zeros(w.out_features) if w.bias is None else w.bias for w in linears),
+            *(t for n in norms for t in (n.weight, n.bias)),
+        ]
         matrices = BlockMatrices(*(panels(w.weight.detach().float().T[None]) for w in linears))
         return cls(matrices, BlockVectors(*(t.detach().float().contiguous().numpy() for t in tensors)), heads)
 
@@ -98,9 +101,9 @@ def _block(
     n, channels = x.shape
     rows, counts = np.arange(n), np.full(1, n)
     normed, placed = empty_rows(n, channels), empty_rows(n, channels)
-    _norm(x, vectors.attention_norm_weight, vectors.attention_norm_bias, normed)
-    _place(normed, offsets, frequency, placed)
-    q, k, v = _sums(n, vectors.query), _sums(n, vectors.key), _sums(n, vectors.value)
+    normalize_rows(x, vectors.attention_norm_weight, vectors.attention_norm_bias, normed)
+    place_rows(normed, offsets, frequency, placed)
+    q, k, v = add_bias_rows(n, vectors.query), add_bias_rows(n, vectors.key), add_bias_rows(n, vectors.value)
     add_products(placed, matrices.query, 0, 1, rows, rows, counts, q)
     add_products(placed, matrices.key, 0, 1, rows, rows, counts, k)
     add_products(normed, matrices.value, 0, 1, rows, rows, counts, v)
@@ -108,17 +111,17 @@ def _block(
     out = empty_rows(n, channels)
     out[:] = x + vectors.output
     add_products(placed, matrices.output, 0, 1, rows, rows, counts, out)
-    _norm(out, vectors.feed_forward_norm_weight, vectors.feed_forward_norm_bias, normed)
-    hidden = _sums(n, vectors.hidden)
+    normalize_rows(out, vectors.feed_forward_norm_weight, vectors.feed_forward_norm_bias, normed)
+    hidden = add_bias_rows(n, vectors.hidden)
     add_products(normed, matrices.hidden, 0, 1, rows, rows, counts, hidden)
-    _gelu(hidden.reshape(-1))
+    apply_gelu(hidden.reshape(-1))
     out += vectors.feed_forward
     add_products(hidden, matrices.feed_forward, 0, 1, rows, rows, counts, out)
     return out
 
 
 @njit(cache=True, nogil=True)
-def _sums(n: int, bias: F32x1) -> F32x2:  # pragma: no cover
+def add_bias_rows(n: int, bias: F32x1) -> F32x2:  # pragma: no cover
     """Return (n, outputs): what the products are added to."""
     out = empty_rows(n, bias.shape[0])
     for i in range(n):
@@ -127,7 +130,7 @@ def _sums(n: int, bias: F32x1) -> F32x2:  # pragma: no cover
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _norm(x: F32x2, weight: F32x1, bias: F32x1, out: F32x2) -> None:  # pragma: no cover
+def normalize_rows(x: F32x2, weight: F32x1, bias: F32x1, out: F32x2) -> None:  # pragma: no cover
     """Layer norm of rows (N, C)."""
     n, channels = x.shape
     for i in range(n):
@@ -143,7 +146,7 @@ def _norm(x: F32x2, weight: F32x1, bias: F32x1, out: F32x2) -> None:  # pragma: 
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _place(x: F32x2, offsets: F32x2, frequency: F32x1, out: F32x2) -> None:  # pragma: no cover
+def place_rows(x: F32x2, offsets: F32x2, frequency: F32x1, out: F32x2) -> None:  # pragma: no cover
     """out = x plus ``sincos_encoding`` of offsets (N, 2)."""
     quarter = frequency.shape[0]
     for i in range(x.shape[0]):
@@ -163,7 +166,7 @@ def _place(x: F32x2, offsets: F32x2, frequency: F32x1, out: F32x2) -> None:  # p
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _gelu(x: F32x1) -> None:  # pragma: no cover
+def apply_gelu(x: F32x1) -> None:  # pragma: no cover
     """x (N,) becomes x / 2 (1 + erf(x / sqrt(2)))."""
     for i in range(np.uintp(x.shape[0])):
         t = np.float32(1) / (np.float32(1) + _ERF_T * abs(x[i]))

@@ -116,38 +116,60 @@ def _flat(*tensors: Tensor) -> list[F32x1]:
     return [t.detach().contiguous().view(-1).numpy() for t in tensors]
 
 
-@njit(cache=True, nogil=True, fastmath=FAST)
+@njit(cache=True, nogil=True)
 def attend(
     q: F32x1, k: F32x1, v: F32x1, out: F32x1, heads: int, width: int, order: I64x1, start: I64x1
 ) -> None:  # pragma: no cover
     """Window by window and head by head, as many queries at once as a tile holds."""
-    max_keys = 4
+    attend_across(q, k, v, out, heads, width, order, start, order, start)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def attend_across(
+    q: F32x1,
+    k: F32x1,
+    v: F32x1,
+    out: F32x1,
+    heads: int,
+    width: int,
+    order: I64x1,
+    start: I64x1,
+    key_order: I64x1,
+    key_start: I64x1,
+) -> None:  # pragma: no cover
+    """As :func:`attend`, of queries to other tokens; both have the same windows, none of them empty."""
+    max_queries, max_keys = 4, 4
     for w in range(start.shape[0] - 1):
-        max_keys = max(max_keys, (start[w + 1] - start[w] + 3) // 4 * 4)
-    rows = np.empty(max_keys, np.uintp)
+        max_queries = max(max_queries, (start[w + 1] - start[w] + 3) // 4 * 4)
+        max_keys = max(max_keys, (key_start[w + 1] - key_start[w] + 3) // 4 * 4)
+    rows, key_rows = np.empty(max_queries, np.uintp), np.empty(max_keys, np.uintp)
     # With a column for each query.
     queries, mixed = np.empty(width * _TILE, np.float32), np.empty(width * _TILE, np.float32)
     weights, sums = np.empty(max_keys * _TILE, np.float32), np.empty(2 * _TILE, np.float32)
     scale = np.float32(math.log2(math.e) / math.sqrt(width))
     for w in range(start.shape[0] - 1):
-        n = start[w + 1] - start[w]
-        padded = (n + 3) // 4 * 4
-        for j in range(padded):
-            # Up to a multiple of four the last token stands again, and is given no weight.
+        n, keys = start[w + 1] - start[w], key_start[w + 1] - key_start[w]
+        padded = (keys + 3) // 4 * 4
+        # Up to a multiple of four the last token stands again, and is given no weight.
+        for j in range((n + 3) // 4 * 4):
             rows[j] = np.uintp(order[start[w] + min(j, n - 1)] * heads * width)
+        for j in range(padded):
+            key_rows[j] = np.uintp(key_order[key_start[w] + min(j, keys - 1)] * heads * width)
         for _ in range(heads):
             for at in range(0, n, _TILE):
                 count = min(n - at, _TILE)
                 wide = (count + _VECTOR - 1) // _VECTOR * _VECTOR
                 some = rows[at : at + (count + 3) // 4 * 4]
                 _gather(q, some, width, wide, scale, queries)
-                _scores(k, rows, queries, weights, padded, width, wide)
-                weights[n * _TILE : padded * _TILE] = np.float32(-1e30)
+                _scores(k, key_rows, queries, weights, padded, width, wide)
+                weights[keys * _TILE : padded * _TILE] = np.float32(-1e30)
                 _exponentials(weights, padded, wide, sums)
-                _mix(v, rows, weights, mixed, padded, width, wide)
+                _mix(v, key_rows, weights, mixed, padded, width, wide)
                 _scatter(mixed, sums, some, width, out)
-            for j in range(padded):
+            for j in range((n + 3) // 4 * 4):
                 rows[j] += np.uintp(width)
+            for j in range(padded):
+                key_rows[j] += np.uintp(width)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)

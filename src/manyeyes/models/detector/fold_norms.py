@@ -8,6 +8,20 @@ import copy
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.layers import DownLayer, SubmanifoldLayer, SubmanifoldStage, UpLayer
 from manyeyes.models.detector.transformer import WindowBlock
+from manyeyes.models.fusion.flow_aware import PastAttention
+from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
+from manyeyes.models.fusion.token_merge import TokenMerge
+
+_FOLDED = (
+    SubmanifoldStage,
+    SubmanifoldLayer,
+    DownLayer,
+    UpLayer,
+    WindowBlock,
+    SpatioTemporalEncoding,
+    PastAttention,
+    TokenMerge,
+)
 
 
 def fold_norms(model: Detector) -> Detector:
@@ -19,6 +33,6 @@ def fold_norms(model: Detector) -> Detector:
     """
     copied = copy.deepcopy(model).eval().requires_grad_(False)
     for layer in copied.modules():
-        if isinstance(layer, SubmanifoldStage | SubmanifoldLayer | DownLayer | UpLayer | WindowBlock):
+        if isinstance(layer, _FOLDED):
             layer.fold()
     return copied

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from manyeyes.models.detector.proposal import PROPOSAL_DIM
+from manyeyes.models.fusion._merge_kernels import EncodingWeights, encode_tokens, layer_pair
 from manyeyes.models.fusion.token_merge import PROPOSAL_SCALE
-from manyeyes.models.fusion.transform_tokens import POSE_CONTEXT_DIM, Tokens
+from manyeyes.models.fusion.transform_tokens import POSE_CONTEXT_DIM, Tokens, is_plain
 
 FRAME_CONTEXT_DIM = 3
 """Number of pose-context columns that describe the sender's frame: height, sine and cosine - 1 of its yaw."""
@@ -29,9 +31,23 @@ class SpatioTemporalEncoding(nn.Module):
         self.temporal = nn.Linear(channels, channels, bias=False)
         nn.init.zeros_(self.outer.weight)
         nn.init.zeros_(self.temporal.weight)
+        self.folded: EncodingWeights | None = None
+
+    def fold(self) -> None:
+        """Copy the weights permanently to one compiled call; those of the layers are unused afterwards."""
+        layers, channels = layer_pair(self.inner, self.outer), self.temporal.in_features
+        if layers is not None:
+            k = np.arange(channels // 2)
+            frequency = (10000.0 ** (-2.0 * k / channels)).astype(np.float32)
+            temporal = self.temporal.weight.detach().float().T.contiguous().numpy().copy()
+            self.folded = EncodingWeights(layers, PROPOSAL_SCALE.numpy(), temporal, frequency)
 
     def forward(self, features: Tensor, tokens: Tokens, cell_offset: Tensor) -> Tensor:
         """Encode features (N, C); cell_offset (N, 2) is measured from the cell centre, in cells. Returns (N, C)."""
+        if self.folded is not None and is_plain(features, tokens.proposal, tokens.pose_context, cell_offset):
+            columns = (features, tokens.pose_context, cell_offset, tokens.proposal)
+            x, context, offset, proposal = (t.contiguous().numpy() for t in columns)
+            return torch.from_numpy(encode_tokens(x, context, offset, proposal, self.folded, FRAME_CONTEXT_DIM))
         context = (
             tokens.pose_context[:, :FRAME_CONTEXT_DIM],
             cell_offset,

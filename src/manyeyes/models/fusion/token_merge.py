@@ -14,7 +14,9 @@ from torch import Tensor, nn
 from manyeyes.datatypes import BevGrid, Sites, SparseBev
 from manyeyes.models.detector.box_head import BOX_LAYOUT
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat, proposed_offset, reset_origin
-from manyeyes.models.fusion.transform_tokens import Tokens
+from manyeyes.models.fusion._merge_kernels import MergeColumns, MergeWeights, layer_pair, merge_tokens
+from manyeyes.models.fusion._transform_kernels import assign
+from manyeyes.models.fusion.transform_tokens import PROPOSAL_COLUMNS, Tokens, grid_cells, is_plain
 from manyeyes.ops.sparse_index import distinct
 from manyeyes.ops.voxelize import segment_max, segment_sum
 
@@ -40,6 +42,13 @@ class FusedBev:
 
 def assign_cells(tokens: Tokens) -> tuple[Tensor, Tensor]:
     """Return the key (N,) of the cell of each token, and the token's offset (N, 2) from that cell's centre, in cells."""
+    if is_plain(tokens.xy, tokens.proposal):
+        key, cell_offset = torch.empty(len(tokens.xy), dtype=torch.int64), torch.empty(len(tokens.xy), 2)
+        xy, proposal = tokens.xy.contiguous().numpy(), tokens.proposal.contiguous().numpy()
+        votes = (MIN_VOTE_LOGIT, MAX_OFFSET_CELLS)
+        grid, ego = grid_cells(tokens.grid), tokens.ego.contiguous().numpy()
+        assign(xy, proposal, ego, PROPOSAL_COLUMNS, votes, grid, key.numpy(), cell_offset.numpy())
+        return key, cell_offset
     key = target_cell_keys(tokens.xy, tokens.proposal, tokens.ego, tokens.grid)
     rows, columns = tokens.grid.shape
     within = key.remainder(rows * columns)
@@ -78,10 +87,28 @@ class TokenMerge(nn.Module):
         with torch.no_grad():
             self.proposal_weight.weight.copy_(torch.tensor([[1.0, 1.0, -1.0]], device="cpu"))
         nn.init.zeros_(self.feature_weight.weight)
+        self.folded: MergeWeights | None = None
+
+    def fold(self) -> None:
+        """Copy the weights permanently to one compiled call; those of the layers are unused afterwards."""
+        layers = layer_pair(self.inner, self.outer)
+        if layers is not None and self.reduce == "softmax":
+            on_proposal, on_feature = (
+                layer.weight.detach().float().flatten().numpy().copy()
+                for layer in (self.proposal_weight, self.feature_weight)
+            )
+            self.folded = MergeWeights(layers, on_proposal, on_feature, PROPOSAL_SCALE.numpy())
 
     def forward(self, features: Tensor, tokens: Tokens, key: Tensor, cell_offset: Tensor) -> FusedBev:
         """Merge features (N, C) of tokens on cells key (N,), at cell_offset (N, 2) from their centres."""
         rows, columns = tokens.grid.shape
+        inputs = (features, tokens.proposal, cell_offset, tokens.pose_context)
+        if self.folded is not None and is_plain(*inputs, tokens.selection_mask):
+            x, proposal, offset, context = (t.contiguous().numpy() for t in inputs)
+            size, drift = tokens.batch_size * rows * columns, DRIFT_MPS * 0.1
+            merged = merge_tokens(x, proposal, offset, context, drift, key.numpy(), size, self.folded, _MERGE_COLUMNS)
+            found, features, merged_proposals = map(torch.from_numpy, merged)
+            return FusedBev(SparseBev(features, Sites(found, tokens.grid, tokens.batch_size)), merged_proposals)
         found, row = distinct(key, tokens.batch_size * rows * columns)
         n = found.shape[0]
         boxes = reset_origin(tokens.proposal, cell_offset)
@@ -115,6 +142,13 @@ def _proposal_scale() -> Tensor:
     return scale
 
 
+_MERGE_COLUMNS = MergeColumns(
+    BOX_LAYOUT.heatmap_logit.start,
+    BOX_LAYOUT.iou_logit.start,
+    BOX_LAYOUT.log_sigma_xy.start,
+    BOX_LAYOUT.offset.start,
+    BOX_LAYOUT.velocity.start,
+)
 PROPOSAL_SCALE = _proposal_scale()
 """Scale of each proposal column that brings its logits to a few units."""
 

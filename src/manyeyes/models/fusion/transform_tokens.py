@@ -6,15 +6,28 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from manyeyes.datatypes import BevGrid, Transform
+from manyeyes.models.detector.box_head import BOX_LAYOUT, SPEED_UNIT
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_velocity, turn_proposal
+from manyeyes.models.fusion._transform_kernels import GridCells, MovedTokens, ProposalColumns, move_tokens
 
 POSE_CONTEXT_DIM = 5
 MAX_SPEED_MPS = 40.0
 """Maximum proposed speed that is used to compensate motion; faster proposals are not moved."""
+PROPOSAL_COLUMNS = ProposalColumns(
+    BOX_LAYOUT.heatmap_logit.start,
+    BOX_LAYOUT.offset.start,
+    BOX_LAYOUT.z.start,
+    BOX_LAYOUT.axis.start,
+    BOX_LAYOUT.direction.start,
+    BOX_LAYOUT.velocity.start,
+    SPEED_UNIT,
+)
+"""Columns of a proposal for the compiled loops."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +119,8 @@ def to_ego_frame(agent_tokens: Iterable[AgentTokens], grid: BevGrid, batch_size:
     tokens.
     """
     parts = list(agent_tokens)
+    if all(part.selection_mask is None and is_plain(part.tokens, part.xy) for part in parts):
+        return _transform_in_loops(parts, grid, batch_size)
     sizes, device = [part.tokens.shape[0] for part in parts], parts[0].tokens.device
     tokens, xy = torch.cat([part.tokens for part in parts]), torch.cat([part.xy for part in parts])
     masks = [
@@ -140,6 +155,35 @@ def to_ego_frame(agent_tokens: Iterable[AgentTokens], grid: BevGrid, batch_size:
     rows = (is_own | grid.contains(xy)).nonzero()[:, 0]
     feature, xy, ego, pose_context, proposal, mask = (column.index_select(0, rows) for column in columns)
     return Tokens(feature, xy, ego, pose_context, proposal, mask, grid, batch_size)
+
+
+def is_plain(*tensors: Tensor) -> bool:
+    """Return whether compiled loops can take these tensors: float32 on the CPU, and none needs a gradient."""
+    return all(
+        t.device.type == "cpu" and t.dtype == torch.float32 and not (t.requires_grad and torch.is_grad_enabled())
+        for t in tensors
+    )
+
+
+def grid_cells(grid: BevGrid) -> GridCells:
+    """Return a grid for the compiled loops."""
+    x_min, y_min, x_max, y_max = (float(v) for v in (grid.x_min, grid.y_min, grid.x_max, grid.y_max))
+    return GridCells(x_min, y_min, x_max, y_max, float(grid.pillar), grid.stride, *grid.shape)
+
+
+def _transform_in_loops(parts: Sequence[AgentTokens], grid: BevGrid, batch_size: int) -> Tokens:
+    """As by tensors, without masks."""
+    tokens, xy = torch.cat([part.tokens for part in parts]), torch.cat([part.xy for part in parts])
+    widths = (tokens.shape[1] - PROPOSAL_DIM, 2, POSE_CONTEXT_DIM, PROPOSAL_DIM)
+    columns, ego = [torch.empty(len(xy), width) for width in widths], torch.empty(len(xy), dtype=torch.int64)
+    features, places, context, proposal = (column.numpy() for column in columns)
+    out = MovedTokens(features, places, context, proposal, ego.numpy())
+    sizes, links = np.array([len(part.xy) for part in parts]), _describe_links(parts).numpy()
+    count = move_tokens(
+        tokens.numpy(), xy.numpy(), sizes, links, MAX_SPEED_MPS, PROPOSAL_COLUMNS, grid_cells(grid), out
+    )
+    features, places, context, proposal = (column[:count] for column in columns)
+    return Tokens(features, places, ego[:count], context, proposal, torch.ones(count), grid, batch_size)
 
 
 def _describe_links(parts: Sequence[AgentTokens]) -> Tensor:
