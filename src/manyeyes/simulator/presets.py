@@ -24,8 +24,8 @@ class SplitPreset:
     """Scenes of one split: count of them, in turn over the towns.
 
     lidar_beams: number of LiDAR beams of all agents of a scene, in turn over the scenes; None for the preset's own sensors.
-    lidars: names in LIDAR_PRESETS of the vehicles' sensors, in turn over the scenes, in place of the preset's. sensor_mix: as in
-    ScenarioSpec; it replaces all these sensors.
+    lidars: names in the table of LiDARs of the vehicles' sensors, in turn over the scenes, in place of the preset's.
+    sensor_mix: as in ScenarioSpec; it replaces all these sensors.
     """
 
     split: str
