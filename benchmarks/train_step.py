@@ -85,7 +85,7 @@ def work(preset: str, data: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(task, Path(folder))
         trainer.step = task.steps // 2
-        _time_parts(task, trainer, spent)
+        _time_parts(task, spent)
         for line in sys.stdin:
             name, *given = line.split()
             if name == "step":
@@ -106,7 +106,7 @@ def work(preset: str, data: Path) -> None:
                 print(json.dumps({"value": float(loss.detach())}), flush=True)
 
 
-def _time_parts(task: object, trainer: object, spent: dict[str, float]) -> None:
+def _time_parts(task: object, spent: dict[str, float]) -> None:
     """Add the CPU time of the parts of a step to spent."""
 
     def timed(owner: object, name: str, part: str) -> None:
@@ -118,9 +118,9 @@ def _time_parts(task: object, trainer: object, spent: dict[str, float]) -> None:
             spent[part] += time.process_time() - before
             return result
 
-        object.__setattr__(owner, name, call)
+        setattr(owner, name, call)
 
-    for owner, name, part in ((task, "draw", "draw"), (task, "loss", "loss"), (trainer, "_backward", "backward")):
+    for owner, name, part in ((task, "draw", "draw"), (task, "loss", "loss"), (torch.Tensor, "backward", "backward")):
         timed(owner, name, part)
 
 
