@@ -53,6 +53,7 @@ def _evaluate(options: Options) -> None:
     from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, load_detector, resolve_protocol, run_benchmark
     from manyeyes.studies import provenance
     from manyeyes.studies.recordings import adapt_to_dataset, check_evaluated_frames, check_files
+    from manyeyes.studies.sensor_notes import print_sensor_note
     from manyeyes.viz.progress import track
     from manyeyes.viz.results import print_comparison, summarize_comparison
     from manyeyes.viz.table import DIFFERENCE_HEADINGS, format_difference_cells, format_markdown, format_markdown_lines
@@ -74,6 +75,7 @@ def _evaluate(options: Options) -> None:
     check_evaluated_frames(recording, recording.scenarios)
     config = replace(config, replay=adapt_to_dataset(config.replay, options.replay_options, recording))
     missing = check_files(recording, options.checks, console)
+    print_sensor_note(recording, recording.scenarios[0], detector, console)
     with track(console, "Evaluating", len(recording.scenarios)) as report:
         results = run_benchmark(opener, config, options.workers, report)
     timed_results = [_measure_times(r, recording, detector, config.replay, options.timing_frames) for r in results]

@@ -16,6 +16,7 @@ from manyeyes.studies.catalog import STUDIES, load_options, run_study
 
 COMMANDS = {
     "demo": "simulate a drive, run every fusion method on it, and write a table, figures, an animation and a report",
+    "check": "check a recording: layout, missing files, sensors, time stamps, labels, distance from the training of weights",
     "simulate": "simulate scenes from a seed, in OPV2V's layout",
     "train": "train a detector on recordings: one stage, or all from nothing to what ships",
     "finetune": "train finished weights on over 20 to 500 labelled frames of your own sensor",

@@ -60,6 +60,7 @@ def _replay(options: Options) -> None:
         select_checked_scenarios,
     )
     from manyeyes.studies.replay_report import REPORT, ReportSpec, replay_and_report
+    from manyeyes.studies.sensor_notes import print_sensor_note
 
     console = Console()
     replay = options.replay_options.make_replay_config(options.seed)
@@ -82,7 +83,9 @@ def _replay(options: Options) -> None:
         missing=missing,
         commands=(f"manyeyes replay {options.recording}{split} --scenario {drive.scenario}",),
     )
-    replay_and_report(drive, pretrained.load(options.replay_options.weights), spec, console)
+    detector = pretrained.load(options.replay_options.weights)
+    print_sensor_note(recording, drive.scenario, detector, console)
+    replay_and_report(drive, detector, spec, console)
     console.print(
         f"\nPictures, animation and JSON are in {options.out}; open {options.out / REPORT}",
         highlight=False,

@@ -74,6 +74,7 @@ _GICP = Requirement("icp", EXTRAS["icp"]).when("correctors", "gicp")
 
 REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
     "demo": (Requirement("sim", EXTRAS["sim"]), Requirement("view", EXTRAS["view"])),
+    "check": (),
     "simulate": (_SUMO, _PILLOW.when("cameras", "True"), _PILLOW.when("preset", "*-camera")),
     "train": (_MATPLOTLIB, _SHAPELY.when("preset", "map-*")),
     "finetune": (),

@@ -57,7 +57,9 @@ def main(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes.datasets.registry import open_recording
+    from manyeyes.models import pretrained
     from manyeyes.studies.recordings import adapt_to_dataset, print_notes
+    from manyeyes.studies.sensor_notes import print_sensor_note
     from manyeyes.viz.animation import save_animation
     from manyeyes.viz.birds_eye import save_png
 
@@ -80,6 +82,7 @@ def main(options: Options) -> None:
     if options.detect is not None:
         replay_options = replace(options.replay_options, methods=(options.detect,))
         config = adapt_to_dataset(replay_options.make_replay_config(0), replay_options, recording)
+        print_sensor_note(drive, drive.scenario, pretrained.load(replay_options.weights), console)
     images = _draw_images(options, drive, range(first, last), config)
     if single:
         save_png(images[0], options.out)

@@ -26,6 +26,7 @@ from manyeyes.datatypes import BevGrid, CheckpointError, ConfigError
 from manyeyes.datatypes.errors import shorten
 from manyeyes.models.detector.detector import Detector, DetectorConfig
 from manyeyes.models.score_calibration import read_score_calibration
+from manyeyes.models.sensor_domain import read_sensor_domain
 from manyeyes.models.token_peaks import read_token_peaks
 
 FORMAT = "manyeyes-detector-1"
@@ -150,6 +151,7 @@ def load(path: Path) -> Detector:
     card = read_card(path)
     model.token_peaks = read_token_peaks(card, model.token_channels, path)
     model.score_calibration = read_score_calibration(card, path)
+    model.sensor_domain = read_sensor_domain(card, path)
     return model
 
 

@@ -23,6 +23,7 @@ from manyeyes.models.fusion.registry import get_fusion
 from manyeyes.models.fusion.token_merge import FusedBev
 from manyeyes.models.fusion.transform_tokens import Tokens
 from manyeyes.models.score_calibration import ScoreCalibration
+from manyeyes.ops.lidar.sweep_statistics import SensorDomain
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,7 @@ class Detector(nn.Module):
         self.fingerprint = bytes(8)
         self.token_peaks: tuple[float, ...] | None = None
         self.score_calibration: ScoreCalibration | None = None
+        self.sensor_domain: SensorDomain | None = None
         self.pillars = PillarEncoder(config.grid, config.pillar_channels, config.pillars, config.sweeps)
         self.encoder = SparseEncoder(config.pillar_channels, config.encoder)
         channels = self.encoder.out_channels

@@ -18,6 +18,7 @@ from manyeyes.models.detector.codebook import CodebookConfig
 from manyeyes.models.detector.detector import Detector, DetectorConfig
 from manyeyes.models.detector.fold_norms import fold_norms
 from manyeyes.models.score_calibration import CARD_KEY as SCORE_KEY
+from manyeyes.models.sensor_domain import CARD_KEY as SENSOR_KEY
 from manyeyes.models.token_peaks import CARD_KEY
 from manyeyes.training.detector.codebook import attach_codebook, fit_codebook
 from manyeyes.training.detector.score_calibration import calibrate_detector
@@ -164,8 +165,9 @@ class PlanRun:
             stride = max(1, frames // plan.codebook_frames)
             detector = fit_codebook(detector, self.recording, seed, plan.codebook, stride, count)
         about = {"seed": seed, "tokens": tokens, "started_from": source}
-        peaks = checkpoint.read_card(weights)[CARD_KEY]
-        checkpoint.save(detector, path, {**card, CARD_KEY: peaks, "codebook": about}, half=True)
+        measured = checkpoint.read_card(weights)
+        kept = {key: measured[key] for key in (CARD_KEY, SENSOR_KEY) if key in measured}
+        checkpoint.save(detector, path, {**card, **kept, "codebook": about}, half=True)
         return path
 
     def _codebook_config(self, given: Detector | None) -> CodebookConfig | None:

@@ -12,15 +12,21 @@ import torch
 from torch import Tensor
 
 from manyeyes.datasets.base import Recording
+from manyeyes.datasets.recording_check import check_recording
 from manyeyes.datatypes import CheckpointError
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector, DetectorConfig
+from manyeyes.models.sensor_domain import write_sensor_domain
 from manyeyes.models.token_peaks import CARD_KEY, NUM_SAMPLES, measure_token_peaks
+from manyeyes.ops.lidar.sweep_statistics import SensorDomain
 from manyeyes.training.detector.losses import LossConfig
 from manyeyes.training.detector.samples import AugmentConfig, DegradationConfig, Sample, SampleStream, epoch_length
 from manyeyes.training.detector.step import loss_terms
 from manyeyes.training.detector.targets import TargetConfig
 from manyeyes.training.trainer import Task, TrainConfig
+
+NUM_SENSOR_SCENARIOS = 60
+"""Maximum number of scenarios whose sensors are measured at the end of training."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +106,7 @@ class DetectorTask(Task[DetectorTrainConfig, Detector, Sample]):
         return terms.total(config.loss), vars(terms)
 
     def finish(self, model: Detector) -> dict[str, Any]:
-        """Measure the range of the tokens on samples after those of training."""
+        """Measure the range of the tokens on samples after those of training, and the sensors of the recording."""
         first, was = self.steps * self.config.batch, model.training
         model.eval()
         views = (view for number in range(first, first + NUM_SAMPLES) for view in self.draw(number).views)
@@ -108,7 +114,15 @@ class DetectorTask(Task[DetectorTrainConfig, Detector, Sample]):
             tokens = (model.extract_tokens(view.cloud, view.previous_cloud)[0].features for view in views)
             peaks = measure_token_peaks(tokens, model.token_channels)
         model.train(was)
-        return {CARD_KEY: peaks}
+        return {CARD_KEY: peaks, **write_sensor_domain(self._measure_sensors())}
+
+    def _measure_sensors(self) -> SensorDomain | None:
+        """Measure the sensors of scenarios that are spread over the recording; intensities as augmentation presents them."""
+        sensors = check_recording(self.stream.recording, NUM_SENSOR_SCENARIOS).sensors
+        periods = [sensor.period_s for sensor in sensors if sensor.period_s is not None]
+        return SensorDomain.of(
+            [sensor.sweep for sensor in sensors], periods, any_intensity=self.config.augment.sensors is not None
+        )
 
 
 def _load_weights(model: Detector, start: Path) -> None:
