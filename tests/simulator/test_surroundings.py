@@ -19,6 +19,7 @@ from manyeyes.simulator.sensors.lidar import RaycastScene, scan
 from manyeyes.simulator.sensors.lidar_spec import LidarSpec, spread_beams
 
 MIDDLE = np.zeros(2)
+NO_POLES = np.zeros((0, 2))
 URBAN = environment_spec("urban-2026")
 LEAFY = CanopySpec(trees=(55.0, 55.0), spacing_m=(5.0, 5.0))
 
@@ -71,7 +72,7 @@ def assert_off_the_road_and_off_vehicles(solids: Primitives, vehicles: VehicleSt
 
 def test_crowns_hang_over_the_road_and_over_parked_vehicles_above_2_5_m() -> None:
     vehicles = parked()
-    solids = place_canopy(around(vehicles), LEAFY, MIDDLE, vehicles, (3,))
+    solids = place_canopy(around(vehicles), LEAFY, MIDDLE, vehicles, NO_POLES, (3,))
     crown = solids.kind == ELLIPSOID
     assert (solids.density[crown] > 0).all()
     assert (solids.density[~crown] == 0).all()
@@ -87,17 +88,29 @@ def test_crowns_hang_over_the_road_and_over_parked_vehicles_above_2_5_m() -> Non
 
 def test_crowns_are_lifted_over_high_vehicles() -> None:
     vehicles = parked(3.9)
-    solids = place_canopy(around(vehicles), LEAFY, MIDDLE, vehicles, (3,))
+    solids = place_canopy(around(vehicles), LEAFY, MIDDLE, vehicles, NO_POLES, (3,))
     for i in np.flatnonzero(solids.kind == ELLIPSOID):
         apart = np.abs(vehicles.position[:, :2] - solids.center[i, :2]) - vehicles.size[:, :2] / 2
         under = np.hypot(*np.maximum(apart, 0).T) < solids.half[i, 0]
         assert not under.any() or solids.center[i, 2] - solids.half[i, 2] > 3.9
 
 
+def test_foliage_keeps_clear_of_roadside_units() -> None:
+    vehicles = parked()
+    everything = place_canopy(around(vehicles), LEAFY, MIDDLE, vehicles, NO_POLES, (3,))
+    crowns = everything[everything.kind == ELLIPSOID]
+    pole = crowns.center[:1, :2] + 0.5
+    left = place_canopy(around(vehicles), LEAFY, MIDDLE, vehicles, pole, (3,))
+    clouds = left[left.kind == ELLIPSOID]
+    assert (np.hypot(*(clouds.center[:, :2] - pole).T) >= clouds.half[:, 0] + 2.0).all()
+    assert len(crowns) - 8 < len(clouds) < len(crowns)
+    np.testing.assert_array_equal(clouds.center[-3:], crowns.center[-3:])
+
+
 def test_a_fifth_of_the_points_of_a_leafy_street_lies_above_3_m_and_many_over_roofs() -> None:
     vehicles, ground = parked(), crossing()
     solids = place_surroundings(
-        PlacementGrid.of(ground), replace(URBAN, canopy=LEAFY), 0.5, 2.0, MIDDLE, (vehicles,), (3,)
+        PlacementGrid.of(ground), replace(URBAN, canopy=LEAFY), 0.5, 2.0, MIDDLE, (vehicles,), NO_POLES, (3,)
     )
     sensor = LidarSpec(units=(spread_beams(32, -25, 15),), per_turn=720)
     pose = Transform.from_xyz_yaw(-20.0, 0.0, 0.0, 0.0)
@@ -157,7 +170,7 @@ def test_yards_hold_bushes_of_the_size_of_vehicles_off_the_pavement() -> None:
 
 def test_the_key_decides_and_the_classic_world_has_nothing_new() -> None:
     def place(world: EnvironmentSpec, key: int) -> Primitives:
-        return place_surroundings(PlacementGrid.of(crossing()), world, 1.0, 2.0, MIDDLE, (parked(),), (key,))
+        return place_surroundings(PlacementGrid.of(crossing()), world, 1.0, 2.0, MIDDLE, (parked(),), NO_POLES, (key,))
 
     one, same, other = (place(URBAN, k) for k in (1, 1, 2))
     np.testing.assert_array_equal(one.center, same.center)

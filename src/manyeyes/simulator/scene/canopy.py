@@ -21,6 +21,7 @@ from manyeyes.simulator.scene.vehicles import VehicleStates
 Array = NDArray[np.float64]
 
 _ROOF_GAP_M = 0.25
+_POLE_GAP_M = 2.0
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,12 @@ class CanopySpec:
 
 
 def place_canopy(
-    plot: PlacementGrid, spec: CanopySpec, middle: Array, vehicles: VehicleStates, key: tuple[int | str, ...]
+    plot: PlacementGrid,
+    spec: CanopySpec,
+    middle: Array,
+    vehicles: VehicleStates,
+    poles: Array,
+    key: tuple[int | str, ...],
 ) -> Primitives:
     """Return the street trees of a scene.
 
@@ -54,6 +60,7 @@ def place_canopy(
         spec: the trees.
         middle: (2,) of the scene, metres.
         vehicles: all that stand or drive under the crowns at any time; an id may occur often.
+        poles: (K, 2) of roadside units, metres, which foliage keeps clear of.
         key: of the draws.
     """
     random = keyed_generator(*key, "canopy")
@@ -70,7 +77,7 @@ def place_canopy(
             continue
         if plot.occupy_if_free(xy, (0.3, 0.3), 0.0, 0.0, 0.75):
             placed.append(xy)
-            _tree(heap, plot, spec, xy, vehicles, random)
+            _tree(heap, plot, spec, xy, (vehicles, poles), random)
     return heap.solids()
 
 
@@ -79,10 +86,14 @@ def _tree(
     plot: PlacementGrid,
     spec: CanopySpec,
     xy: Array,
-    vehicles: VehicleStates,
+    keep_clear: tuple[VehicleStates, Array],
     random: np.random.Generator,
 ) -> None:
-    """A trunk, a main cloud of foliage that leans towards the road, and two branches, one of them over the road."""
+    """A trunk, a main cloud of foliage that leans towards the road, and two branches, one of them over the road.
+
+    keep_clear: vehicles and poles.
+    """
+    vehicles, poles = keep_clear
     ground = float(plot.height(xy))
     _, away = plot.road_clearance(xy)
     base, reach, depth = (float(random.uniform(*r)) for r in (spec.base_m, spec.reach_m, spec.depth_m))
@@ -93,9 +104,11 @@ def _tree(
     for angle in (to_road + spread[0], to_road + math.pi + spread[1]):
         share = float(random.uniform(0.4, 0.6))
         clouds.append((angle, (1 - share) * reach, share * reach, depth * share / 2, float(random.uniform(0.0, 0.4))))
-    top = 0.0
+    top = ground + base
     for angle, distance, wide, half_z, lift in clouds:
         center = xy + distance * np.array([math.cos(angle), math.sin(angle)])
+        if (np.hypot(*(poles - center).T) < wide + _POLE_GAP_M).any():
+            continue
         low = max(ground, float(plot.height(center))) + base + lift * depth
         low = max(low, _clear_height(vehicles, center, wide))
         top = max(top, low + half_z)

@@ -404,15 +404,16 @@ def _place_static_objects(
     still = drawn[drawn.speed == 0]
     for position, size, yaw in zip(still.position, still.size, still.yaw):
         plot.occupy(position[:2], (float(size[0]) / 2 + 0.5, float(size[1]) / 2 + 0.5), float(yaw))
-    roadside, solids = None, []
+    roadside, solids, poles = None, [], np.zeros((0, 2))
     if random.random() < spec.roadside_chance:
         roadside = _roadside(plot, middle, spec, random)
     if roadside is not None:
         xyz = roadside.world_from_agent.translation.numpy()
         plot.occupy(xyz[:2], (1.0, 1.0), 0.0)
+        poles = xyz[None, :2]
         solids.append(make_pole(xyz[:2], float(xyz[2]), roadside.lidar.height_m - 0.3, RSU_ID))
     setback_m = float(random.uniform(1.5, 6.0))
-    solids.append(place_surroundings(plot, world, spec.clutter, setback_m, middle, states, (spec.seed,)))
+    solids.append(place_surroundings(plot, world, spec.clutter, setback_m, middle, states, poles, (spec.seed,)))
     shapes: dict[int, VehicleShape] = {}
     for now in states:
         for id, kind, size in zip(now.id.tolist(), now.kind.tolist(), now.size.tolist()):

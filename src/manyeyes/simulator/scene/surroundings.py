@@ -31,6 +31,7 @@ def place_surroundings(
     setback_m: float,
     middle: Array,
     states: tuple[VehicleStates, ...],
+    poles: Array,
     key: tuple[int | str, ...],
 ) -> Primitives:
     """Return the solids of a scene.
@@ -42,6 +43,7 @@ def place_surroundings(
         setback_m: of the buildings' fronts from the pavement.
         middle: (2,) of the scene, metres.
         states: vehicles of all instants; none of them meets anything but open air where the world is not the classic one.
+        poles: (K, 2) of roadside units, metres.
         key: of the draws.
     """
     solids = []
@@ -51,7 +53,7 @@ def place_surroundings(
             half = float(size[0]) / 2 + _VEHICLE_CLEARANCE_M, float(size[1]) / 2 + _VEHICLE_CLEARANCE_M
             plot.occupy_all(position[:2], half, float(yaw))
         if world.canopy:
-            solids.append(place_canopy(plot, world.canopy, middle, everyone, key))
+            solids.append(place_canopy(plot, world.canopy, middle, everyone, poles, key))
     if world.furniture:
         solids.append(place_street_furniture(plot, _scale(world.furniture, clutter), middle, key))
     if world.yards:
