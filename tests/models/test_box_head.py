@@ -2,12 +2,22 @@
 """Encoding and decoding of boxes at every head stride; decoding of unusual batches."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from manyeyes.datatypes import VEHICLE_LABELS, BevGrid, Boxes, Sites, SparseBev
-from manyeyes.models.detector.box_head import SPEED_UNIT, TYPICAL_SIZE, WIDTHS, BoxHead, DecodeConfig, RawBoxes, decode
+from manyeyes.datatypes import LABELS, VEHICLE_LABELS, BevGrid, Boxes, ConfigError, Sites, SparseBev
+from manyeyes.models.detector.box_head import (
+    SPEED_UNIT,
+    TYPICAL_SIZE,
+    WIDTHS,
+    BoxHead,
+    DecodeConfig,
+    RawBoxes,
+    RefineHead,
+    decode,
+)
 from manyeyes.ops.box_iou import pairwise_iou
 from manyeyes.training.detector.targets import TargetConfig, assign_targets
 
@@ -135,3 +145,56 @@ def test_untrained_head_predicts_few_boxes():
     with torch.no_grad():
         raw = head(SparseBev(torch.randn(64, 8), Sites(torch.arange(64), GRID.at(8))))
     assert 0.05 < float(torch.sigmoid(raw.heatmap_logit).mean()) < 0.2
+
+
+CLASSES_IN_ORDER = ("vehicle", "pedestrian", "cyclist")
+
+
+def test_one_heat_map_per_class_gives_boxes_with_labels_and_suppresses_within_a_class() -> None:
+    """A car and a pedestrian share a cell, and a cyclist stands elsewhere; a second pedestrian there is suppressed."""
+    sites = every_site(1)
+    boxes = Boxes.of([[3.0, 2.0, 0.8]], [[4.0, 1.8, 1.5]], [0.3], label=[2])
+    raw = encode(boxes.to(torch.float32), sites)
+    best = int(raw.heatmap_logit.argmax())
+    heat = torch.full((len(sites), 3), -9.0)
+    heat[best, 0], heat[best, 1], heat[best + 1, 1], heat[0, 2] = 2.0, 1.0, 0.5, 1.5
+    several = replace(raw, class_heat=heat, classes=CLASSES_IN_ORDER, iou_logit=torch.full((len(sites),), 4.0))
+    several = replace(several, offset=several.offset.clone())
+    several.offset[best + 1] = several.offset[best] + (sites.xy[best] - sites.xy[best + 1]) / sites.grid.cell_size_m
+    for name in ("z", "log_size", "axis", "direction", "class_logits"):
+        value = getattr(several, name).clone()
+        value[best + 1] = value[best]
+        several = replace(several, **{name: value})
+    (found,) = decode(several, DecodeConfig())
+    assert [LABELS[label] for label in found.label.tolist()] == ["truck", "cyclist", "pedestrian"]
+    assert found.score.tolist() == sorted(found.score.tolist(), reverse=True)
+    torch.testing.assert_close(found.center[0], found.center[2])
+
+
+def test_a_head_of_several_classes_shows_the_maximum_to_proposals_and_selection() -> None:
+    torch.manual_seed(3)
+    x = SparseBev(torch.randn(len(every_site(2)), 8), every_site(2))
+    head, refine = BoxHead(8, 16, CLASSES_IN_ORDER).eval(), RefineHead(8, 16, CLASSES_IN_ORDER).eval()
+    raw = head(x)
+    assert raw.class_heat is not None and raw.class_heat.shape == (len(x.sites), 3)
+    assert torch.equal(raw.heatmap_logit, raw.class_heat.amax(1)) and raw.to_rows().shape[1] == sum(WIDTHS)
+    refined = refine(x, raw.to_rows())
+    assert refined.class_heat is not None and refined.classes == CLASSES_IN_ORDER
+    assert torch.equal(refined.class_heat, raw.heatmap_logit[:, None].expand(-1, 3))  # residuals begin at zero
+    some = raw.select(torch.tensor([1, 3]))
+    assert some.class_heat is not None and torch.equal(some.class_heat, raw.class_heat[[1, 3]])
+
+
+def test_one_class_has_the_tensors_of_earlier_weights() -> None:
+    assert {k: v.shape for k, v in BoxHead(8, 16).state_dict().items()} == {
+        k: v.shape for k, v in BoxHead(8, 16, ("vehicle",)).state_dict().items()
+    }
+    assert BoxHead(8, 16).out.out_features == sum(WIDTHS) and BoxHead(8, 16, ("pedestrian",)).out.out_features == sum(
+        WIDTHS
+    )
+
+
+@pytest.mark.parametrize("classes", [(), ("vehicle", "vehicle"), ("vehicle", "horse")])
+def test_classes_that_cannot_be_are_refused(classes: tuple[str, ...]) -> None:
+    with pytest.raises(ConfigError, match="class"):
+        BoxHead(8, 16, classes)

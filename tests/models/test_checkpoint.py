@@ -86,6 +86,17 @@ def test_fingerprint_depends_on_weights_and_configuration(model):
     assert fingerprint(renamed) != fingerprint(model)
 
 
+def test_classes_are_stored_where_they_are_not_the_default_alone(model, tmp_path):
+    """Weights of earlier versions have no such field; their fingerprints hold."""
+    assert "classes" not in config_to_json(COSTR_TINY)
+    several = dataclasses.replace(COSTR_TINY, classes=("vehicle", "pedestrian", "cyclist"))
+    assert config_from_json(DetectorConfig, config_to_json(several)) == several
+    assert config_from_json(DetectorConfig, config_to_json(COSTR_TINY)) == COSTR_TINY
+    checkpoint.save(Detector(several), tmp_path / "several.safetensors", {"command": "test"})
+    loaded = checkpoint.load(tmp_path / "several.safetensors")
+    assert loaded.config.classes == several.classes and loaded.head.classes == several.classes
+
+
 def test_weights_of_another_shape_name_the_tensor(path):
     rewrite(path, lambda state, _: state.update({"head.out.weight": torch.zeros(3, 5)}))
     assert "tensor head.out.weight is (3, 5) in the file" in error(path)

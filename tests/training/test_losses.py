@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from manyeyes.datatypes import BevGrid, Boxes, Sites
+from manyeyes.datatypes import LABELS, BevGrid, Boxes, Sites
 from manyeyes.models.detector.box_head import SPEED_UNIT, WIDTHS, RawBoxes
 from manyeyes.models.detector.pruning import PruneOutput
 from manyeyes.training.detector.losses import (
@@ -18,7 +18,7 @@ from manyeyes.training.detector.losses import (
     head_terms,
     prune_focal,
 )
-from manyeyes.training.detector.targets import TargetConfig, Targets, assign_targets
+from manyeyes.training.detector.targets import TargetConfig, Targets, add_class_heat, assign_targets
 
 GRID = BevGrid(-12.8, -12.8, -3.0, 12.8, 12.8, 5.0).at(4)
 SITES = Sites(torch.arange(GRID.shape[0] * GRID.shape[1]), GRID)
@@ -176,3 +176,31 @@ def test_the_total_is_the_weighted_sum():
     )  # fmt: skip
     wanted = 2 * float(terms.heat.detach()) + 0.25 * float(terms.velocity.detach()) + 1.0 + 0.3 + 0.04
     assert float(terms.total(weights).detach()) == pytest.approx(wanted, rel=1e-6)
+
+
+def test_heat_maps_of_classes_have_their_own_centres_and_people_no_kind_of_vehicle():
+    classes, config = ("vehicle", "pedestrian"), TargetConfig()
+    pedestrian = dataclasses.replace(
+        one_box(), center=torch.tensor([[5.0, 4.0, 0.9]]), label=torch.tensor([LABELS.index("pedestrian")])
+    )
+    both = Boxes.cat([one_box(), pedestrian])
+    plain = assign_targets(SITES, [both], config)
+    targets = add_class_heat(plain, SITES, [both], classes, config)
+    assert add_class_heat(plain, SITES, [both], ("vehicle",), config) is plain
+    assert targets.class_heat is not None and targets.class_positive is not None
+    for column, box in enumerate((one_box(), pedestrian)):
+        alone = assign_targets(SITES, [box], config)
+        assert torch.equal(targets.class_heat[:, column], alone.heat)
+        assert torch.equal(targets.class_positive[:, column], alone.positive)
+    heat = torch.randn(len(SITES), 2, generator=torch.Generator().manual_seed(7)).requires_grad_()
+    some = dataclasses.replace(raw(), class_heat=heat, classes=classes)
+    terms = terms_of(some, targets)
+    expected = sum(
+        float(centre_focal(heat[:, c].detach(), targets.class_heat[:, c], targets.class_positive[:, c]))
+        for c in range(2)
+    )
+    assert float(terms.heat.detach()) == pytest.approx(expected, rel=1e-6)
+    people = dataclasses.replace(targets, boxes=Boxes.cat([pedestrian, pedestrian]))
+    assert float(terms_of(some, people).classification) == 0 and float(terms.classification) > 0
+    terms.heat.backward()
+    assert heat.grad is not None and bool((heat.grad.abs().sum(0) > 0).all())

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from manyeyes.datatypes import BevGrid
+from manyeyes.datatypes import LABELS, VEHICLES, BevGrid
+from manyeyes.models.detector.box_head import BOX_LAYOUT
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
 from manyeyes.training.detector.losses import LossConfig
@@ -200,3 +201,23 @@ def test_study_targets_use_the_egos_windows_and_train_only_the_selector(detector
         assert taught == {"selector"}
     model.zero_grad()
     detector.train()
+
+
+def test_a_step_of_a_detector_of_several_classes_trains_every_heat_map(toy):
+    """The toy's cars are made pedestrians and cyclists in turn."""
+    classes = ("vehicle", "pedestrian", "cyclist")
+    recording = toy(agents_n=2, points_per_car=20, ground_points=60)
+    snapshot = recording.snapshot("toy_0", 0)
+    kinds = torch.tensor([LABELS.index(name) for name in ("car", "pedestrian", "motorcyclist")])
+    boxes = replace(snapshot.truth.boxes, label=kinds[torch.arange(len(snapshot.truth.boxes)) % 3])
+    mixed = replace(snapshot, truth=replace(snapshot.truth, boxes=boxes))
+    some, cars = (
+        make_sample([mixed], 0, GRID, AugmentConfig.none(), ("step",), classes=c) for c in (classes, VEHICLES)
+    )
+    assert set(some.merged_gt_boxes.class_rows(classes).tolist()) == {0, 1, 2}
+    assert set(cars.merged_gt_boxes.label.tolist()) == {0}
+    model = Detector(replace(COSTR_TINY, classes=classes))
+    loss_terms(model, [some], TargetConfig()).total(LossConfig()).backward()
+    for head in (model.head, model.refine):
+        gradient = head.out.bias.grad
+        assert gradient is not None and bool((gradient[BOX_LAYOUT.total :] != 0).all())

@@ -133,7 +133,7 @@ class Boxes:
         if unknown:
             raise ConfigError(f"No class of objects is called {unknown[0]!r}; known: {', '.join(CLASSES)}.")
         row = [classes.index(CLASSES[kind]) if CLASSES[kind] in classes else -1 for kind in _CLASS_OF_LABEL]
-        return torch.tensor(row)[self.label]
+        return torch.tensor(row, device=self.label.device)[self.label]
 
     def of_classes(self, classes: Sequence[str] = VEHICLES) -> Boxes:
         """Return the boxes of the listed classes."""

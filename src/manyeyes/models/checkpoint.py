@@ -41,8 +41,21 @@ Model = TypeVar("Model", bound=nn.Module)
 
 
 def config_to_json(config: Any) -> str:
-    """Serialise a nested frozen dataclass to JSON with sorted keys."""
-    return json.dumps(dataclasses.asdict(config), sort_keys=True)
+    """Serialise a nested frozen dataclass to JSON with sorted keys; fields that say so are absent at their default."""
+    return json.dumps(_to_plain(config), sort_keys=True)
+
+
+def _to_plain(value: Any) -> Any:
+    if isinstance(value, tuple | list):
+        return [_to_plain(item) for item in value]
+    if not dataclasses.is_dataclass(value):
+        return value
+    shown = [
+        (f.name, getattr(value, f.name))
+        for f in dataclasses.fields(value)
+        if not (f.metadata.get("omit_default") and getattr(value, f.name) == f.default)
+    ]
+    return {name: _to_plain(item) for name, item in shown}
 
 
 def config_from_json(kind: type, text: str) -> Any:

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor, nn
 
-from manyeyes.datatypes import VEHICLE_LABELS, Boxes, Sites, SparseBev
+from manyeyes.datatypes import LABELS, VEHICLE_LABELS, VEHICLES, Boxes, ConfigError, Sites, SparseBev
 from manyeyes.models.detector.layers import SubmanifoldLayer
 from manyeyes.ops.nms import rotated_nms
 
@@ -52,6 +53,9 @@ class RawBoxes:
         log_sigma_yaw: (N,) of radians.
         iou_logit: (N,) logit of the expected IoU of the box.
         velocity: (N, 2) over the ground, in SPEED_UNIT.
+        class_heat: (N, classes) logits that an object of each class is centred here, of which heatmap_logit is the maximum; None of
+            one class. A proposal does not hold it: fused features tell the class anew.
+        classes: of ``datatypes.CLASSES``, in the order of class_heat.
     """
 
     sites: Sites
@@ -66,6 +70,8 @@ class RawBoxes:
     log_sigma_yaw: Tensor
     iou_logit: Tensor
     velocity: Tensor
+    class_heat: Tensor | None = None
+    classes: tuple[str, ...] = VEHICLES
 
     @classmethod
     def of(cls, rows: Tensor, sites: Sites) -> RawBoxes:
@@ -91,11 +97,16 @@ class RawBoxes:
     def select(self, rows: Tensor) -> RawBoxes:
         """Select a subset of the sites by ascending rows (n,) int64."""
         sites = Sites(self.sites.key.index_select(0, rows), self.sites.grid, self.sites.batch_size)
-        return RawBoxes.of(self.to_rows().index_select(0, rows), sites)
+        heat = None if self.class_heat is None else self.class_heat.index_select(0, rows)
+        return replace(RawBoxes.of(self.to_rows().index_select(0, rows), sites), class_heat=heat, classes=self.classes)
 
     def on(self, sites: Sites) -> RawBoxes:
         """Return the same outputs with an equal set of sites, on the device of that set."""
-        return self if self.sites is sites else RawBoxes.of(self.to_rows().to(sites.key.device), sites)
+        if self.sites is sites:
+            return self
+        device = sites.key.device
+        heat = None if self.class_heat is None else self.class_heat.to(device)
+        return replace(RawBoxes.of(self.to_rows().to(device), sites), class_heat=heat, classes=self.classes)
 
 
 def axis_yaw(axis: Tensor) -> Tensor:
@@ -117,36 +128,69 @@ def _trunk(inputs: int, channels: int) -> nn.Sequential:
     )
 
 
-class BoxHead(nn.Module):
-    """Two submanifold layers and one linear layer to all quantities of RawBoxes."""
+def check_classes(classes: Sequence[str]) -> tuple[str, ...]:
+    """Return the classes of a head.
 
-    def __init__(self, inputs: int, channels: int) -> None:
+    Raises:
+        ConfigError: there is none, one is listed twice, or one is unknown.
+    """
+    Boxes.empty().class_rows(classes)
+    if not classes or len(set(classes)) < len(classes):
+        raise ConfigError(f"A detector needs at least one class, each once; got {', '.join(classes) or 'none'}.")
+    return tuple(classes)
+
+
+def _num_columns(classes: Sequence[str]) -> int:
+    """Return the number of outputs: one class needs no heat beside heatmap_logit."""
+    return BOX_LAYOUT.total + (len(classes) if len(classes) > 1 else 0)
+
+
+def _with_class_heat(rows: Tensor, class_heat: Tensor, sites: Sites, classes: tuple[str, ...]) -> RawBoxes:
+    """Return raw boxes of rows (N, BOX_LAYOUT.total) whose heat is the maximum of class_heat (N, classes)."""
+    raw = RawBoxes.of(rows, sites)
+    return replace(raw, heatmap_logit=class_heat.amax(1), class_heat=class_heat, classes=classes)
+
+
+class BoxHead(nn.Module):
+    """Two submanifold layers and one linear layer to all quantities of RawBoxes, with one heat map per class."""
+
+    def __init__(self, inputs: int, channels: int, classes: Sequence[str] = VEHICLES) -> None:
         super().__init__()
+        self.classes = check_classes(classes)
         self.shared = _trunk(inputs, channels)
-        self.out = nn.Linear(channels, BOX_LAYOUT.total)
+        self.out = nn.Linear(channels, _num_columns(classes))
         nn.init.normal_(self.out.weight, std=0.02)
         nn.init.zeros_(self.out.bias)
         with torch.no_grad():
             self.out.bias[0] = -2.19
+            self.out.bias[BOX_LAYOUT.total :] = -2.19
 
     def forward(self, x: SparseBev) -> RawBoxes:
         """Predict one raw box per site."""
-        return RawBoxes.of(self.out(self.shared(x).features), x.sites)
+        rows = self.out(self.shared(x).features)
+        if len(self.classes) == 1:
+            return replace(RawBoxes.of(rows, x.sites), classes=self.classes)
+        return _with_class_heat(rows[:, : BOX_LAYOUT.total], rows[:, BOX_LAYOUT.total :], x.sites, self.classes)
 
 
 class RefineHead(nn.Module):
-    """A centre head that predicts residuals to given boxes; zero-initialised."""
+    """A centre head that predicts residuals to given boxes, and to their heat for each class; zero-initialised."""
 
-    def __init__(self, inputs: int, channels: int) -> None:
+    def __init__(self, inputs: int, channels: int, classes: Sequence[str] = VEHICLES) -> None:
         super().__init__()
+        self.classes = check_classes(classes)
         self.shared = _trunk(inputs, channels)
-        self.out = nn.Linear(channels, BOX_LAYOUT.total)
+        self.out = nn.Linear(channels, _num_columns(classes))
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
     def forward(self, x: SparseBev, proposals: Tensor) -> RawBoxes:
         """Refine proposals (N, BOX_LAYOUT.total) of the same sites."""
-        return RawBoxes.of(proposals + self.out(self.shared(x).features), x.sites)
+        residual = self.out(self.shared(x).features)
+        if len(self.classes) == 1:
+            return replace(RawBoxes.of(proposals + residual, x.sites), classes=self.classes)
+        rows = proposals + residual[:, : BOX_LAYOUT.total]
+        return _with_class_heat(rows, rows[:, :1] + residual[:, BOX_LAYOUT.total :], x.sites, self.classes)
 
 
 @dataclass(frozen=True)
@@ -162,8 +206,30 @@ class DecodeConfig:
 
 
 def decode(raw: RawBoxes, config: DecodeConfig) -> list[Boxes]:
-    """Decode the boxes of every grid of the batch, in the agent's frame, in descending order of score."""
-    heatmap, iou = torch.sigmoid(raw.heatmap_logit.detach()), torch.sigmoid(raw.iou_logit.detach())
+    """Decode the boxes of every grid of the batch, in the agent's frame, in descending order of score.
+
+    Boxes of one class suppress each other. Vehicles have the label of class_logits, people that of their class.
+    """
+    if raw.class_heat is None:
+        found = _decode_class(raw, raw.heatmap_logit, config)
+        return found if raw.classes == VEHICLES else [_relabel(boxes, raw.classes[0]) for boxes in found]
+    by_class = [
+        [_relabel(boxes, name) for boxes in _decode_class(raw, heat, config)]
+        for name, heat in zip(raw.classes, raw.class_heat.unbind(1))
+    ]
+    together = [Boxes.cat(list(parts)) for parts in zip(*by_class)]
+    order = [boxes.score.argsort(descending=True, stable=True)[: config.max_boxes] for boxes in together]
+    return [boxes[rows] for boxes, rows in zip(together, order)]
+
+
+def _relabel(boxes: Boxes, name: str) -> Boxes:
+    """Return boxes of a class with its label; those of vehicles have labels of their own."""
+    return boxes if name in VEHICLES else replace(boxes, label=torch.full_like(boxes.label, LABELS.index(name)))
+
+
+def _decode_class(raw: RawBoxes, heatmap_logit: Tensor, config: DecodeConfig) -> list[Boxes]:
+    """Decode the boxes of every grid by a heat map (N,)."""
+    heatmap, iou = torch.sigmoid(heatmap_logit.detach()), torch.sigmoid(raw.iou_logit.detach())
     score = heatmap ** (1 - config.iou_score_weight) * iou**config.iou_score_weight
     batch, found = raw.sites.batch, []
     for b in range(raw.sites.batch_size):

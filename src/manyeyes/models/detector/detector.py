@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes._bounds import ChannelCount, FiniteFloat
-from manyeyes.datatypes import BevGrid, Boxes, PointCloud, SparseBev
+from manyeyes.datatypes import VEHICLES, BevGrid, Boxes, PointCloud, SparseBev
 from manyeyes.models.detector.box_head import BoxHead, DecodeConfig, RawBoxes, RefineHead, decode
 from manyeyes.models.detector.codebook import Codebook, CodebookConfig
 from manyeyes.models.detector.encoder import EncoderConfig, SparseEncoder
@@ -38,6 +38,7 @@ class DetectorConfig:
         output_range: range in which boxes are evaluated where it is smaller than grid; None for all of grid.
         sweeps: number of consecutive sweeps in the input.
         codebook: of the token encoding; None before one is fitted.
+        classes: of objects that are detected, of ``datatypes.CLASSES``; one heat map for each.
     """
 
     grid: BevGrid
@@ -53,6 +54,8 @@ class DetectorConfig:
     output_range: BevGrid | None = None
     sweeps: Literal[1, 2] = 1
     codebook: CodebookConfig | None = None
+    # Absent from stored configurations where it is the default, so that fingerprints of earlier weights hold.
+    classes: tuple[str, ...] = field(default=VEHICLES, metadata={"omit_default": True})
 
 
 @dataclass(frozen=True)
@@ -82,8 +85,8 @@ class Detector(nn.Module):
         self.token_prune = FocalPrune(channels)
         self.selector = Selector(channels)
         self.fusion = get_fusion(config.fusion)(channels, config.fusion_attention)
-        self.head = BoxHead(channels, config.head_channels)
-        self.refine = RefineHead(channels, config.head_channels)
+        self.head = BoxHead(channels, config.head_channels, config.classes)
+        self.refine = RefineHead(channels, config.head_channels, config.classes)
         self.codebook = None if config.codebook is None else Codebook(channels, config.codebook)
 
     @property

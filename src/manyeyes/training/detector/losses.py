@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from manyeyes.datatypes import VEHICLE_LABELS, VEHICLES, Boxes
 from manyeyes.models.detector.box_head import SPEED_UNIT, TYPICAL_SIZE, RawBoxes, axis_yaw, heading_logit
 from manyeyes.models.detector.pruning import PruneOutput
 from manyeyes.ops.box_iou import aligned_iou
@@ -110,7 +111,7 @@ def prune_focal(pruned: PruneOutput, near: Tensor, num_boxes: int, alpha: float 
 
 def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor, mask_l1: Tensor, information: Tensor) -> LossTerms:
     """Compute all terms of one batch; each is finite, and zero without targets."""
-    heat = centre_focal(raw.heatmap_logit, targets.heat, targets.positive)
+    heat = _heat_term(raw, targets)
     rows = (targets.box >= 0).nonzero()[:, 0]
     if not len(rows):
         zero = raw.heatmap_logit.sum() * 0
@@ -130,7 +131,7 @@ def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor, mask_l1: Tensor, 
     turn = truth.yaw - yaw
     ahead = (turn.cos() > 0).float()
     direction = functional.binary_cross_entropy_with_logits(heading_logit(some), ahead, reduction="none")
-    kind = functional.cross_entropy(some.class_logits, truth.label, reduction="none")
+    kind = _kind_term(some, truth)
     sigma = _gaussian_nll(((some.offset - offset) * some.sites.grid.cell_size_m).detach(), some.log_sigma_xy)
     axis_error = torch.atan2((2 * turn).sin(), (2 * turn).cos())[:, None] / 2
     sigma = sigma + _gaussian_nll(axis_error, some.log_sigma_yaw)
@@ -141,6 +142,23 @@ def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor, mask_l1: Tensor, 
     speed = (some.velocity - truth.velocity / SPEED_UNIT).abs().sum(1)
     rest = (mean(sigma), mean(overlap), mean(1 - iou), mean(speed), prune, mask_l1, information)
     return LossTerms(heat, mean(shape), mean(direction), mean(kind), *rest)
+
+
+def _heat_term(raw: RawBoxes, targets: Targets) -> Tensor:
+    """Return the focal loss of the heat map, or of those of all classes together."""
+    if raw.class_heat is None or targets.class_heat is None or targets.class_positive is None:
+        return centre_focal(raw.heatmap_logit, targets.heat, targets.positive)
+    columns = zip(raw.class_heat.unbind(1), targets.class_heat.unbind(1), targets.class_positive.unbind(1))
+    return torch.stack([centre_focal(*column) for column in columns]).sum()
+
+
+def _kind_term(some: RawBoxes, truth: Boxes) -> Tensor:
+    """Return the cross-entropy (N,) of the kind of vehicle; 0 of people, whose class is that of their heat map."""
+    if some.classes == VEHICLES:
+        return functional.cross_entropy(some.class_logits, truth.label, reduction="none")
+    last = len(VEHICLE_LABELS) - 1
+    entropy = functional.cross_entropy(some.class_logits, truth.label.clamp_max(last), reduction="none")
+    return torch.where(truth.label <= last, entropy, 0.0)
 
 
 def _gaussian_nll(error: Tensor, log_sigma: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from manyeyes.agents.level_frame import SnapshotLeveller, clean_frame
 from manyeyes.datasets.base import Recording, iter_eval_frames
 from manyeyes.datasets.deferred import read_deferred
 from manyeyes.datasets.mixed import draw_scenario
-from manyeyes.datatypes import BevGrid, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
+from manyeyes.datatypes import VEHICLES, BevGrid, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.training.detector.sensor_augmentation import SensorAugmentation, SensorAugmentConfig
 from manyeyes.training.mirroring import mirror_factors, resize_cloud, resize_transform
@@ -141,16 +141,17 @@ def make_sample(
     key: tuple[int | str, ...],
     degradation: DegradationConfig | None = None,
     leveller: SnapshotLeveller | None = None,
+    classes: Sequence[str] = VEHICLES,
 ) -> Sample:
     """Make the sample of this ego, a row of the last snapshot; key determines every random choice.
 
     snapshots: consecutive snapshots, oldest first; the last is the current one. Too few of them shorten the history.
-    leveller: levels the frames that are used; None for frames that are level.
+    leveller: levels the frames that are used; None for frames that are level. classes: of the ground truth.
     """
     degradation = degradation or DegradationConfig()
     rng = keyed_generator("augment", *key)
-    scene = _AugmentedScene(snapshots, rng, config, key, leveller)
-    now = snapshots[-1]
+    scene = _AugmentedScene([_select_truth(s, classes) for s in snapshots], rng, config, key, leveller)
+    now = _select_truth(snapshots[-1], classes)
     chosen = _choose_agents(len(now.frames), ego, config.max_agents, rng)
     ids = [now.frames[i].agent_id for i in chosen]
     flip = config.flip and rng.random() < 0.5
@@ -327,7 +328,12 @@ def _truth(snapshot: Snapshot) -> GroundTruth:
         raise ConfigError(
             f"Scenario {snapshot.scenario}, frame {snapshot.index} has no truth: it cannot be used for training or evaluation."
         )
-    return snapshot.truth.of_classes()
+    return snapshot.truth
+
+
+def _select_truth(snapshot: Snapshot, classes: Sequence[str]) -> Snapshot:
+    """Return the snapshot with the truth of some classes."""
+    return snapshot if snapshot.truth is None else replace(snapshot, truth=snapshot.truth.of_classes(classes))
 
 
 def _displaced(pose: Transform, off: np.ndarray | None) -> Transform:
@@ -369,6 +375,7 @@ class SampleStream:
     augment: AugmentConfig
     seed: int
     degradation: DegradationConfig = DegradationConfig()
+    classes: tuple[str, ...] = VEHICLES
     _leveller: SnapshotLeveller = field(default_factory=SnapshotLeveller, repr=False, compare=False)
 
     def draw(self, number: int) -> Sample:
@@ -384,7 +391,8 @@ class SampleStream:
         )
         moments = [read_deferred(self.recording, scenario, i) for i in range(max(0, index - back), index + 1)]
         ego = int(rng.integers(len(moments[-1].frames)))
-        return make_sample(moments, ego, self.grid, self.augment, (self.seed, number), self.degradation, self._leveller)
+        key = self.seed, number
+        return make_sample(moments, ego, self.grid, self.augment, key, self.degradation, self._leveller, self.classes)
 
 
 def epoch_length(recording: Recording) -> int:

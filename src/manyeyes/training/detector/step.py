@@ -26,7 +26,13 @@ from manyeyes.training.detector.mutual_information import (
     mutual_information_loss,
 )
 from manyeyes.training.detector.samples import AgentView, Sample
-from manyeyes.training.detector.targets import BoxBatch, TargetConfig, assign_targets, find_nearby_objects
+from manyeyes.training.detector.targets import (
+    BoxBatch,
+    TargetConfig,
+    add_class_heat,
+    assign_targets,
+    find_nearby_objects,
+)
 
 TOKENS_PER_PACKET = 8
 """Number of tokens lost together: a packet of 1,398 bytes holds about as many float16 features."""
@@ -173,16 +179,20 @@ def loss_terms(
     """
     out = forward(model, samples, prune_threshold)
     device = out.mask.device
-    listed = BoxBatch.of([view.visible_boxes for sample in samples for view in sample.views], device)
-    union = BoxBatch.of([sample.merged_gt_boxes for sample in samples], device)
+    listed_boxes = [view.visible_boxes for sample in samples for view in sample.views]
+    merged_boxes, classes = [sample.merged_gt_boxes for sample in samples], model.config.classes
+    listed, union = BoxBatch.of(listed_boxes, device), BoxBatch.of(merged_boxes, device)
     found = ((pruned, find_nearby_objects(pruned.sites, listed, targets)) for pruned in out.features.pruned)
     prune = torch.stack([prune_focal(pruned, near, len(listed.boxes)) for pruned, near in found]).mean()
-    own = assign_targets(out.single_agent_boxes.sites, listed, targets)
+    sites = out.single_agent_boxes.sites
+    own = add_class_heat(assign_targets(sites, listed, targets), sites, listed_boxes, classes, targets)
     kept, information = mutual_information_loss(out.shared_tokens, out.mask, own.heat)
     if target != "own_task":
         information = STUDY_TARGETS[target](pair_agent_tokens(out, samples))
     alone = head_terms(out.single_agent_boxes, own, prune, kept, information)
-    fused = head_terms(out.fused_boxes, assign_targets(out.fused_boxes.sites, union, targets), prune, kept, information)
+    sites = out.fused_boxes.sites
+    both = add_class_heat(assign_targets(sites, union, targets), sites, merged_boxes, classes, targets)
+    fused = head_terms(out.fused_boxes, both, prune, kept, information)
     return alone.mix(fused, fusion_weight)
 
 

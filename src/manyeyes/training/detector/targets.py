@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate, count
 
 import torch
@@ -39,7 +39,8 @@ class Targets:
 
     heat: (N,), exactly 1 at one distinct site per box. box: (N,) int64, row of the assigned box, -1 for none. weight:
     (N,), of the shape
-    loss. boxes: the M boxes. positive: (N,) bool, where heat is exactly 1.
+    loss. boxes: the M boxes. positive: (N,) bool, where heat is exactly 1. class_heat, class_positive: (N, classes), the same for
+    each class of a detector of several; None of one.
     """
 
     heat: Tensor
@@ -47,6 +48,8 @@ class Targets:
     weight: Tensor
     boxes: Boxes
     positive: Tensor
+    class_heat: Tensor | None = None
+    class_positive: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +112,17 @@ def assign_targets(sites: Sites, truth: Sequence[Boxes] | BoxBatch, config: Targ
     positive = centre >= 0
     box = torch.where(positive, centre, box)
     return Targets(heat.masked_fill(positive, 1.0), box, weight.masked_fill(positive, 1.0), batch.boxes, positive)
+
+
+def add_class_heat(
+    targets: Targets, sites: Sites, truth: Sequence[Boxes], classes: Sequence[str], config: TargetConfig
+) -> Targets:
+    """Return the targets with a heat map for each class; unchanged for one class. truth: of every grid of the batch."""
+    if len(classes) == 1:
+        return targets
+    parts = [assign_targets(sites, [boxes.of_classes((name,)) for boxes in truth], config) for name in classes]
+    heat, positive = ([getattr(part, name) for part in parts] for name in ("heat", "positive"))
+    return replace(targets, class_heat=torch.stack(heat, 1), class_positive=torch.stack(positive, 1))
 
 
 def match_pairs(site: Tensor, box: Tensor, num_sites: int, num_boxes: int) -> Tensor:

@@ -73,7 +73,9 @@ class DetectorTask(Task[DetectorTrainConfig, Detector, Sample]):
     ) -> None:
         self.config, self.seed, self._start = config, seed, start
         self._steps = config.steps or math.ceil(config.epochs * epoch_length(recording) / config.batch)
-        self.stream = SampleStream(recording, config.detector.grid, config.augment, seed, config.degradation)
+        self.stream = SampleStream(
+            recording, config.detector.grid, config.augment, seed, config.degradation, config.detector.classes
+        )
 
     @property
     def is_initialised(self) -> bool:
