@@ -12,6 +12,7 @@ import hashlib
 import os
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -86,7 +87,8 @@ def main(options: Options) -> None:
     torch.set_num_threads(options.threads)
     is_distributed = int(os.environ.get("WORLD_SIZE", "1")) > 1
     if is_distributed:
-        dist.init_process_group("gloo")
+        # Between stages of a plan the others wait for the first, which fits the codebook and calibrates.
+        dist.init_process_group("gloo", timeout=timedelta(hours=12))
     is_first = not is_distributed or dist.get_rank() == 0
     try:
         with hold_folder(out) if is_first else nullcontext():
