@@ -147,7 +147,7 @@ def random_detector(config: DetectorConfig, frames: list[AgentFrame]) -> Detecto
         cache.run_detector(frames[0].points)
     for norm, momentum in zip(norms, momenta):
         norm.momentum = momentum
-    return fold_norms(model)
+    return fold_norms(model, in_bfloat16=True)
 
 
 def set_kept(model: Detector, kept: Kept | None) -> None:

@@ -12,6 +12,7 @@ from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.fold_norms import fold_norms
 from manyeyes.models.detector.layers import ActiveNorm
 from manyeyes.models.detector.presets import COSTR_TINY
+from manyeyes.ops._sparse_conv_kernels import HAS_BFLOAT16
 
 
 def _model(head_stride: int) -> tuple[Detector, PointCloud]:
@@ -55,3 +56,16 @@ def test_no_norm_is_left_in_the_encoder_and_the_head_keeps_its_own() -> None:
     assert [m for m in copied.head.modules() if isinstance(m, torch.nn.LayerNorm)]
     assert copied.fingerprint == model.fingerprint
     assert copied.config == model.config
+
+
+@pytest.mark.skipif(not HAS_BFLOAT16, reason="this processor has no products of bfloat16")
+def test_products_of_bfloat16_change_little_and_leave_the_heads_in_float32() -> None:
+    model, cloud = _model(4)
+    rounded, exact = fold_norms(model, in_bfloat16=True), fold_norms(model)
+    with torch.inference_mode():
+        ours, theirs = (m.extract_features([cloud], prune_threshold=0.0).tokens for m in (rounded, exact))
+    difference = float((ours.features - theirs.features).abs().max())
+    assert 1e-4 < difference < 0.1 * float(theirs.features.abs().max())
+    for copied, dtype in ((rounded, torch.int32), (exact, torch.float32)):
+        assert {layer.folded.weight.dtype for layer in copied.encoder.down} == {dtype}
+        assert {layer.folded.weight.dtype for layer in (*copied.head.shared, *copied.refine.shared)} == {torch.float32}

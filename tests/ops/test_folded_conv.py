@@ -9,9 +9,16 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import BevGrid, Sites, SparseBev
-from manyeyes.ops._sparse_conv_kernels import empty_rows, panels
-from manyeyes.ops.folded_conv import FoldedConvs, NormedConv, is_supported
-from manyeyes.ops.sparse_conv import same_sites_map, strided_conv, strided_map, submanifold_conv
+from manyeyes.ops._sparse_conv_kernels import HAS_BFLOAT16, empty_rows, panels, round_rows
+from manyeyes.ops.folded_conv import FoldedConvs, FoldedUp, NormedConv, is_supported
+from manyeyes.ops.sparse_conv import (
+    inverse_conv,
+    inverse_map,
+    same_sites_map,
+    strided_conv,
+    strided_map,
+    submanifold_conv,
+)
 from manyeyes.ops.sparse_index import Window
 
 GROUND = BevGrid(-12.8, -6.4, -3.0, 12.8, 6.4, 1.0)
@@ -113,3 +120,41 @@ def test_rows_begin_with_a_line_of_the_cache() -> None:
         block[:] = len(block)
     assert all((block == len(block)).all() for block in blocks)
     assert all(not np.shares_memory(a, b) for a, b in pairwise(blocks))
+
+
+@pytest.mark.parametrize("channels", [1, 6, 33, 64])
+def test_rows_are_rounded_to_the_nearest_bfloat16(channels: int) -> None:
+    x = torch.randn(50, channels, generator=torch.Generator().manual_seed(1))
+    x[0], x[1, 0] = 0.0, 1.00390625  # halfway between two, to the even one
+    pairs = torch.from_numpy(round_rows(x.numpy())).view(torch.bfloat16).view(50, -1)
+    assert torch.equal(pairs[:, :channels], x.bfloat16())
+    assert not pairs[:, channels:].any()
+
+
+@pytest.mark.skipif(not HAS_BFLOAT16, reason="this processor has no products of bfloat16")
+@pytest.mark.parametrize(("inputs", "outputs"), [(16, 16), (33, 32), (64, 112), (128, 256)])
+@torch.no_grad()
+def test_products_of_bfloat16_are_those_of_rounded_numbers(inputs: int, outputs: int) -> None:
+    x, (weight, bias) = scene(inputs), layer(inputs, outputs, 3, seed=0)
+    folded = FoldedConvs.of([weight], [bias], in_bfloat16=True)
+    assert folded is not None and folded.weight.dtype == torch.int32
+    rounded = x.with_features(x.features.bfloat16().double())
+    wanted = torch.relu(submanifold_conv(rounded, weight.bfloat16().double(), bias.double()).features).float()
+    assert torch.allclose(folded(x.features, same_sites_map(x.sites, 3)), wanted, atol=1e-4, rtol=1e-4)
+    exact = torch.relu(submanifold_conv(x, weight, bias).features)
+    assert 1e-4 < float((wanted - exact).abs().max()) < 0.05 * float(exact.abs().max())
+
+
+@torch.no_grad()
+def test_an_inverse_convolution_with_its_lateral_layer() -> None:
+    fine = scene(32)
+    sites, _ = strided_map(fine.sites, Window(3, 2, 1))
+    random = torch.Generator().manual_seed(2)
+    coarse = SparseBev(torch.randn(len(sites), 48, generator=random), sites)
+    weight, bias = layer(48, 64, 3, seed=1)
+    lateral = torch.randn(64, 32, generator=random)
+    folded = FoldedUp.of(weight, lateral, bias)
+    assert folded is not None
+    up = inverse_conv(coarse, weight.transpose(0, 1), fine.sites, bias).features
+    got = folded(coarse.features, fine.features, inverse_map(fine.sites, sites))
+    assert torch.allclose(got, torch.relu(up + fine.features @ lateral.T), atol=1e-4, rtol=1e-4)

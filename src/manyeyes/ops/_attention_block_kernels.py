@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes._jit import F32x1, F32x2, F32x4, I64x1, njit
-from manyeyes.ops._sparse_conv_kernels import LANES, add_products, empty_rows, panels
+from manyeyes.ops._sparse_conv_kernels import HAS_BFLOAT16, LANES, add_products, empty_rows, panels
 from manyeyes.ops._window_attention_kernels import FAST, WindowRuns, attend, power_of_two
 
 _EPS = 1e-5
@@ -65,15 +65,22 @@ class BlockWeights:
     heads: int
 
     @classmethod
-    def of(cls, linears: list[nn.Linear], norms: list[nn.LayerNorm], heads: int) -> BlockWeights | None:
-        """Return copies of the weights of six layers and two norms; None where the loops do not know such."""
+    def of(
+        cls, linears: list[nn.Linear], norms: list[nn.LayerNorm], heads: int, in_bfloat16: bool = False
+    ) -> BlockWeights | None:
+        """Return copies of the weights of six layers and two norms; None where the loops do not know such.
+
+        in_bfloat16: linear layers by products of bfloat16 with float32 sums, where the processor has them.
+        """
         if any(n.eps != _EPS for n in norms) or any(w.out_features % LANES or w.weight.is_cuda for w in linears):
             return None
         tensors = [
             *(torch.zeros(w.out_features) if w.bias is None else w.bias for w in linears),
             *(t for n in norms for t in (n.weight, n.bias)),
         ]
-        matrices = BlockMatrices(*(panels(w.weight.detach().float().T[None]) for w in linears))
+        matrices = BlockMatrices(
+            *(panels(w.weight.detach().float().T[None], in_bfloat16 and HAS_BFLOAT16) for w in linears)
+        )
         return cls(matrices, BlockVectors(*(t.detach().float().contiguous().numpy() for t in tensors)), heads)
 
 

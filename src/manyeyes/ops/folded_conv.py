@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes._jit import F32x1, F32x2, F32x4, F32x5, njit
-from manyeyes.ops._sparse_conv_kernels import LANES, convolve, empty_rows, panels
+from manyeyes.ops._sparse_conv_kernels import HAS_BFLOAT16, LANES, add_products, convolve, empty_rows, panels
 from manyeyes.ops.sparse_index import NeighbourMap, Pairs
 
 
@@ -28,18 +28,56 @@ class FoldedConvs:
     bias: Tensor
 
     @classmethod
-    def of(cls, weights: Sequence[Tensor], biases: Sequence[Tensor]) -> FoldedConvs | None:
-        """Return copies of weights (D, C, k, k) and biases (D,); None where the loops do not know such."""
+    def of(
+        cls, weights: Sequence[Tensor], biases: Sequence[Tensor], *, in_bfloat16: bool = False
+    ) -> FoldedConvs | None:
+        """Return copies of weights (D, C, k, k) and biases (D,); None where the loops do not know such.
+
+        in_bfloat16: products of bfloat16 with float32 sums, where the processor has them.
+        """
         if not weights or any(w.shape[0] % LANES or w.dtype != torch.float32 or w.is_cuda for w in weights):
             return None
         taps = (w.detach().permute(2, 3, 1, 0).reshape(-1, w.shape[1], w.shape[0]) for w in weights)
-        return cls(torch.stack([torch.from_numpy(panels(t)) for t in taps]), torch.stack([b.detach() for b in biases]))
+        in_bfloat16 = in_bfloat16 and HAS_BFLOAT16
+        return cls(
+            torch.stack([torch.from_numpy(panels(t, in_bfloat16)) for t in taps]),
+            torch.stack([b.detach() for b in biases]),
+        )
 
     @torch.no_grad()
     def __call__(self, x: Tensor, table: NeighbourMap) -> Tensor:
         """Apply all layers, (N, C) to (M, D); more than one need a table that leads from a set of sites to itself."""
         rows, weight, bias = (t.numpy() for t in (x.contiguous(), self.weight, self.bias))
         return torch.from_numpy(_layers(rows, weight, bias, table.pairs, table.is_symmetric, table.n_out))
+
+
+@dataclass(frozen=True, eq=False)
+class FoldedUp:
+    """An inverse convolution added to a lateral layer, with bias and ReLU.
+
+    weight: (taps, D / width, C, width); lateral: (1, D / width, L, width), the ``panels`` of both; bias: (D,).
+    """
+
+    weight: Tensor
+    lateral: Tensor
+    bias: Tensor
+
+    @classmethod
+    def of(cls, weight: Tensor, lateral: Tensor, bias: Tensor, in_bfloat16: bool = False) -> FoldedUp | None:
+        """Return copies of weight (D, C, k, k), lateral (D, L) and bias (D,); None where the loops do not know such."""
+        convs = FoldedConvs.of([weight], [bias], in_bfloat16=in_bfloat16)
+        if convs is None:
+            return None
+        matrix = panels(lateral.detach().T[None], in_bfloat16 and HAS_BFLOAT16)
+        return cls(convs.weight[0], torch.from_numpy(matrix), convs.bias[0])
+
+    @torch.no_grad()
+    def __call__(self, coarse: Tensor, fine: Tensor, table: NeighbourMap) -> Tensor:
+        """Return (N, D) on the finer sites; table: from the finer sites (N,) to the coarser, whose pairs are turned round."""
+        rows, beside = coarse.contiguous().numpy(), fine.contiguous().numpy()
+        weight, lateral, bias = (t.numpy() for t in (self.weight, self.lateral, self.bias))
+        turned = Pairs(table.pairs.target, table.pairs.source, table.pairs.counts)
+        return torch.from_numpy(_convolve_up(rows, weight, beside, lateral, bias, turned))
 
 
 class _RowNorm(NamedTuple):
@@ -94,6 +132,22 @@ def _layers(
     for layer in range(1, weight.shape[0]):
         convolve(out, weight[layer], bias[layer], pairs, is_symmetric, True, spare)
         out, spare = spare, out
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _convolve_up(
+    x: F32x2, weight: F32x4, fine: F32x2, lateral: F32x4, bias: F32x1, pairs: Pairs
+) -> F32x2:  # pragma: no cover
+    n = fine.shape[0]
+    out, rows = empty_rows(n, bias.shape[0]), np.arange(n)
+    for i in range(n):
+        out[i] = bias
+    add_products(fine, lateral, 0, 1, rows, rows, np.full(1, n), out)
+    add_products(x, weight, 0, 1, pairs.source, pairs.target, pairs.counts, out)
+    flat = out.reshape(-1)
+    for i in range(np.uintp(flat.shape[0])):
+        flat[i] = max(flat[i], np.float32(0))
     return out
 
 

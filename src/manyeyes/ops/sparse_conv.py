@@ -81,12 +81,17 @@ def inverse_conv(
 ) -> SparseBev:
     """Back to the finer sites ``target``: ``conv_transpose2d`` read there; weight (in, out, k, k)."""
     kernel = _kernel(weight, x.features.shape[1], axis=0)
-    table = _pair_map(target, x.sites, _check_window(target, Window(kernel, stride, padding)))
+    table = inverse_map(target, x.sites, kernel, stride, padding)
     if target.grid.at(target.grid.stride * stride) != x.grid or target.batch_size != x.sites.batch_size:
         raise ShapeError(
             f"inverse_conv by {stride} needs a target on the grid before it; got {target.grid} from {x.grid}."
         )
     return SparseBev(_conv(x.features, weight.transpose(0, 1), bias, table, reverse=True), target)
+
+
+def inverse_map(target: Sites, sites: Sites, kernel: int = 3, stride: int = 2, padding: int = 1) -> NeighbourMap:
+    """Return what the coarser sites meet among the finer ``target``, as a strided convolution; kept in ``target``."""
+    return _pair_map(target, sites, _check_window(target, Window(kernel, stride, padding)))
 
 
 def max_pool(x: SparseBev, kernel: int = 3) -> SparseBev:

@@ -24,15 +24,17 @@ _FOLDED = (
 )
 
 
-def fold_norms(model: Detector) -> Detector:
+def fold_norms(model: Detector, in_bfloat16: bool = False) -> Detector:
     """Copy a detector in evaluation mode, without gradients, with its norms folded into the convolutions.
 
-    Outputs are equal and inference is faster. Configuration and fingerprint are kept, so that messages of the
+    Outputs are equal and inference is faster. in_bfloat16: convolutions of the encoder and linear layers of attention blocks
+    multiply bfloat16 with float32 sums where the processor has such products; then outputs differ by its rounding. Norms, softmax
+    and heads stay in float32. Configuration and fingerprint are kept, so that messages of the
     original model can be
     decoded. The copy cannot be saved or trained.
     """
     copied = copy.deepcopy(model).eval().requires_grad_(False)
     for layer in copied.modules():
         if isinstance(layer, _FOLDED):
-            layer.fold()
+            layer.fold(in_bfloat16)
     return copied

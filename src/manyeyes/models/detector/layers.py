@@ -11,8 +11,15 @@ from torch import Tensor, nn
 
 from manyeyes.datatypes import Sites, SparseBev
 from manyeyes.ops.active_norm import RunningStatistics, norm_relu
-from manyeyes.ops.folded_conv import FoldedConvs, NormedConv, is_supported
-from manyeyes.ops.sparse_conv import inverse_conv, same_sites_map, strided_conv, strided_map, submanifold_conv
+from manyeyes.ops.folded_conv import FoldedConvs, FoldedUp, NormedConv, is_supported
+from manyeyes.ops.sparse_conv import (
+    inverse_conv,
+    inverse_map,
+    same_sites_map,
+    strided_conv,
+    strided_map,
+    submanifold_conv,
+)
 from manyeyes.ops.sparse_index import Window
 
 
@@ -101,10 +108,10 @@ class SubmanifoldLayer(nn.Module):
         y = submanifold_conv(x, self.weight, self.bias).features
         return x.with_features(_norm_relu(self.norm, y, x.features if self.skip else None))
 
-    def fold(self) -> None:
+    def fold(self, in_bfloat16: bool = False) -> None:
         """Fold the norm's running statistics into the weight, and the skip into its centre tap, permanently.
 
-        A LayerNorm has no running statistics: it stays, and so does the skip after it, in the same compiled call.
+        A LayerNorm has no running statistics: it stays, in float32, and so does the skip after it, in the same compiled call.
         """
         if isinstance(self.norm, nn.LayerNorm):
             self.folded = NormedConv.of(self.weight, self.norm, self.skip)
@@ -115,7 +122,7 @@ class SubmanifoldLayer(nn.Module):
                 middle = weight.shape[2] // 2
                 self.weight[:, :, middle, middle] += torch.eye(len(weight), dtype=weight.dtype, device=weight.device)
                 self.skip = False
-            self.folded = FoldedConvs.of([self.weight], [self.bias])
+            self.folded = FoldedConvs.of([self.weight], [self.bias], in_bfloat16=in_bfloat16)
 
 
 class SubmanifoldStage(nn.Sequential):
@@ -131,14 +138,16 @@ class SubmanifoldStage(nn.Sequential):
             return input.with_features(self.folded(input.features, same_sites_map(input.sites, kernel=3)))
         return super().forward(input)
 
-    def fold(self) -> None:
+    def fold(self, in_bfloat16: bool = False) -> None:
         """Fold every layer permanently into the weights of one compiled call."""
         layers = [layer for layer in self if isinstance(layer, SubmanifoldLayer)]
         for layer in layers:
             layer.fold()
             layer.folded = None
         self.folded = FoldedConvs.of(
-            [layer.weight for layer in layers], [layer.bias for layer in layers if layer.bias is not None]
+            [layer.weight for layer in layers],
+            [layer.bias for layer in layers if layer.bias is not None],
+            in_bfloat16=in_bfloat16,
         )
 
 
@@ -164,12 +173,12 @@ class DownLayer(nn.Module):
         y = strided_conv(x, self.weight, self.bias, stride=2, padding=1, dilating=self.dilating)
         return y.with_features(_norm_relu(self.norm, y.features, None))
 
-    def fold(self) -> None:
+    def fold(self, in_bfloat16: bool = False) -> None:
         """Fold the norm's running statistics into the weight, permanently."""
         if isinstance(self.norm, ActiveNorm):
             weight, self.bias = fold_norm(self.weight.detach(), self.norm)
             self.weight, self.norm = nn.Parameter(weight, requires_grad=False), nn.Identity()
-            self.folded = FoldedConvs.of([self.weight], [self.bias])
+            self.folded = FoldedConvs.of([self.weight], [self.bias], in_bfloat16=in_bfloat16)
 
 
 class UpLayer(nn.Module):
@@ -184,16 +193,20 @@ class UpLayer(nn.Module):
         self.norm: nn.Module = ActiveNorm(outputs)
         self.lateral = nn.Linear(lateral, outputs, bias=False)
         self.register_buffer("bias", None, persistent=False)
+        self.folded: FoldedUp | None = None
 
     def forward(self, coarse: SparseBev, fine: SparseBev) -> SparseBev:
         """Upsample coarse features to the sites of ``fine``."""
         sites: Sites = fine.sites
+        if self.folded is not None and is_supported(coarse.features) and is_supported(fine.features):
+            return fine.with_features(self.folded(coarse.features, fine.features, inverse_map(sites, coarse.sites)))
         y = inverse_conv(coarse, self.weight, sites, self.bias, stride=2, padding=1)
         return fine.with_features(_norm_relu(self.norm, y.features + self.lateral(fine.features), None))
 
-    def fold(self) -> None:
+    def fold(self, in_bfloat16: bool = False) -> None:
         """Fold the norm's running statistics into both weights, permanently."""
         if isinstance(self.norm, ActiveNorm):
             weight, self.bias = fold_norm(self.weight.detach().transpose(0, 1), self.norm)
             self.lateral.weight = nn.Parameter(fold_norm(self.lateral.weight.detach(), self.norm)[0], False)
             self.weight, self.norm = nn.Parameter(weight.transpose(0, 1), requires_grad=False), nn.Identity()
+            self.folded = FoldedUp.of(weight, self.lateral.weight, self.bias, in_bfloat16)

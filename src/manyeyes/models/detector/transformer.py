@@ -95,10 +95,10 @@ class WindowBlock(nn.Module):
         features = features + self.out(attended.flatten(1))
         return features + self.ffn(self.norm_ffn(features))
 
-    def fold(self) -> None:
+    def fold(self, in_bfloat16: bool = False) -> None:
         """Copy the weights permanently to one compiled call; those of the layers are unused afterwards."""
         linears = [self.query, self.key, self.value, self.out, self.ffn[0], self.ffn[2]]
-        self.folded = BlockWeights.of(linears, [self.norm, self.norm_ffn], self.heads)
+        self.folded = BlockWeights.of(linears, [self.norm, self.norm_ffn], self.heads, in_bfloat16)
 
 
 class RoutedBlock(nn.Module):

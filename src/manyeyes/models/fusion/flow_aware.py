@@ -49,9 +49,9 @@ class PastAttention(nn.Module):
             nn.init.zeros_(nothing)
         self.folded: PastWeights | None = None
 
-    def fold(self) -> None:
+    def fold(self, in_bfloat16: bool = False) -> None:
         """Copy the weights permanently to one compiled call; those of the layers are unused afterwards."""
-        self.folded = PastWeights.of(self)
+        self.folded = PastWeights.of(self, in_bfloat16)
 
     def forward(self, features: Tensor, tokens: Tokens, past_features: Tensor, past: Tokens) -> Tensor:
         """Update features (N, C) of tokens by attention to past_features (M, C), both position-encoded; returns (N,
@@ -95,11 +95,11 @@ class PastWeights:
     vectors: PastVectors
 
     @classmethod
-    def of(cls, layer: PastAttention) -> PastWeights | None:
+    def of(cls, layer: PastAttention, in_bfloat16: bool = False) -> PastWeights | None:
         """Return copies of the weights; None where the loops do not know such."""
         linears = [layer.query, layer.key, layer.value, layer.out, layer.ffn[0], layer.ffn[2]]
         norms = [layer.norm, layer.norm_past, layer.norm_ffn]
-        block = BlockWeights.of(linears, norms[:2], layer.heads)
+        block = BlockWeights.of(linears, norms[:2], layer.heads, in_bfloat16)
         if block is None:
             return None
         biased = [linear for linear in linears if linear is not layer.out]

@@ -33,8 +33,8 @@ class SpatioTemporalEncoding(nn.Module):
         nn.init.zeros_(self.temporal.weight)
         self.folded: EncodingWeights | None = None
 
-    def fold(self) -> None:
-        """Copy the weights permanently to one compiled call; those of the layers are unused afterwards."""
+    def fold(self, in_bfloat16: bool = False) -> None:
+        """Copy the weights permanently to one compiled call, in float32; those of the layers are unused afterwards."""
         layers, channels = layer_pair(self.inner, self.outer), self.temporal.in_features
         if layers is not None:
             k = np.arange(channels // 2)

@@ -89,8 +89,8 @@ class TokenMerge(nn.Module):
         nn.init.zeros_(self.feature_weight.weight)
         self.folded: MergeWeights | None = None
 
-    def fold(self) -> None:
-        """Copy the weights permanently to one compiled call; those of the layers are unused afterwards."""
+    def fold(self, in_bfloat16: bool = False) -> None:
+        """Copy the weights permanently to one compiled call, in float32; those of the layers are unused afterwards."""
         layers = layer_pair(self.inner, self.outer)
         if layers is not None and self.reduce == "softmax":
             on_proposal, on_feature = (
