@@ -158,6 +158,18 @@ def test_the_height_is_found_in_the_cloud_where_no_column_states_it(tmp_path: Pa
     assert open_recording(tmp_path).snapshot("walk", 0).frames[0].sensor_height_m == pytest.approx(1.8, abs=0.8)
 
 
+def test_the_body_of_the_vehicle_is_in_the_frame(tmp_path: Path) -> None:
+    write_agent(tmp_path / "walk", 3, (T0,))
+    path = tmp_path / "walk" / "poses.csv"
+    head, row = path.read_text().splitlines()
+    path.write_text(f"{head},body_x,body_y,body_length,body_width,body_height\n{row},0.4,-0.1,4.6,1.9,1.5\n")
+    body = open_recording(tmp_path).snapshot("walk", 0).frames[0].body
+    assert body is not None and (body.center, body.size) == ((0.4, -0.1, 0.75), (4.6, 1.9, 1.5))
+    path.write_text(f"{head},body_x,body_y,body_length,body_width,body_height\n{row},0.4,-0.1,-4.6,1.9,1.5\n")
+    with pytest.raises(RecordingError, match="body_x to body_height is no body"):
+        open_recording(tmp_path)
+
+
 def test_clouds_may_have_names_of_their_own(tmp_path: Path) -> None:
     write_agent(tmp_path / "walk", 3, (T0,))
     (tmp_path / "walk" / "clouds" / f"{T0}.bin").rename(tmp_path / "walk" / "clouds" / "000000.bin")

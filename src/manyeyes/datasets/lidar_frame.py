@@ -4,13 +4,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from manyeyes.datasets.formats.pcd import PcdCloud
-from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Transform
+from manyeyes.datatypes import (
+    AgentBody,
+    AgentFrame,
+    Boxes,
+    GroundTruth,
+    PointCloud,
+    RecordingError,
+    ShapeError,
+    Transform,
+)
 
 
 def rotation_of_quaternion(quaternion: Tensor) -> Tensor:
@@ -32,11 +42,12 @@ def make_lidar_frame(
     timestamp_ns: int = 0,
     speed_mps: float = 0.0,
     is_infrastructure: bool = False,
+    body: AgentBody | None = None,
 ) -> AgentFrame:
     """Return the frame of an agent whose origin lies on the road, sensor_height_m below its LiDAR along the LiDAR's z axis.
 
     cloud: in the LiDAR's frame, x ahead, y left. Points at the LiDAR itself, which are no returns, are dropped. Times of points
-    that are not within a second of timestamp_ns are zero: they count by another clock.
+    that are not within a second of timestamp_ns are zero: they count by another clock. body: in the frame that is returned.
     """
     met = cloud.xyz.any(axis=1)
     xyz = cloud.xyz[met]
@@ -54,7 +65,21 @@ def make_lidar_frame(
         sensor_height_m=sensor_height_m,
         speed_mps=speed_mps,
         is_infrastructure=is_infrastructure,
+        body=body,
     )
+
+
+def make_body(path: Path, where: str, values: Sequence[float]) -> AgentBody:
+    """Return a body that stands on the road: x, y of its middle in the agent's frame, then length, width, height, metres.
+
+    Raises:
+        RecordingError: a number is out of bounds; where: what is named in the text.
+    """
+    x, y, length, width, height = values
+    try:
+        return AgentBody.standing(x, y, (length, width, height))
+    except ShapeError as error:
+        raise RecordingError(f"{path}: {where} is no body of a vehicle ({error}); correct it.") from None
 
 
 def merge_listed_boxes(listed: Sequence[Boxes], frames: Sequence[AgentFrame]) -> GroundTruth:

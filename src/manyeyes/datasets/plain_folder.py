@@ -4,7 +4,9 @@
 ``<scenario>/<agent>/poses.csv`` and ``<scenario>/<agent>/clouds/<timestamp_ns>.bin`` (or ``.pcd``, ``.npz``); an agent is named by
 its number, a roadside unit by a negative one. One agent alone may lie in the scenario's folder itself. Columns of ``poses.csv``:
 ``timestamp_ns``, ``x``, ``y``, ``z`` and ``qw``, ``qx``, ``qy``, ``qz`` or ``roll``, ``pitch``, ``yaw`` (radians, R = Rz Ry Rx):
-world from LiDAR, right-handed, metres. Optional: ``cloud`` (a file in the agent's folder), ``speed_mps``, ``sensor_height_m``.
+world from LiDAR, right-handed, metres. Optional: ``cloud`` (a file in the agent's folder), ``speed_mps``, ``sensor_height_m``, and
+``body_x``, ``body_y``, ``body_length``, ``body_width``, ``body_height`` (of the vehicle's own body, its middle ahead and to the
+left of the LiDAR).
 
 ``boxes.csv`` beside it holds true boxes that the agent observes, in the world: ``timestamp_ns``, ``id``, ``label``, ``x``, ``y``,
 ``z`` (the middle), ``length``, ``width``, ``height``, ``yaw``, and optionally ``vx``, ``vy``; an object has one id in all tables.
@@ -24,17 +26,18 @@ from manyeyes.datasets.base import RecordingReader, require_index
 from manyeyes.datasets.box_table import BoxTable
 from manyeyes.datasets.formats.point_file import SUFFIXES, read_cloud
 from manyeyes.datasets.ground_height import estimate_sensor_height
-from manyeyes.datasets.lidar_frame import make_lidar_frame, merge_listed_boxes, rotation_of_quaternion
+from manyeyes.datasets.lidar_frame import make_body, make_lidar_frame, merge_listed_boxes, rotation_of_quaternion
 from manyeyes.datasets.missing import FileProblem
 from manyeyes.datasets.registry import register_dataset
 from manyeyes.datasets.tables import Table
-from manyeyes.datatypes import AgentFrame, RecordingError, Snapshot, Transform
+from manyeyes.datatypes import AgentBody, AgentFrame, RecordingError, Snapshot, Transform
 
 POSES, BOXES, CLOUDS = "poses.csv", "boxes.csv", "clouds"
 MAX_OFFSET_NS = 50_000_000
 """Sweeps of two agents belong to one snapshot if their times differ by no more."""
 _AGENT = re.compile(r"-?\d+")
 _POLE_RANGE_M = 40.0
+_BODY = ("body_x", "body_y", "body_length", "body_width", "body_height")
 
 
 def _is_agent(folder: Path) -> bool:
@@ -71,6 +74,7 @@ class AgentTable:
     height_m: np.ndarray | None
     boxes: BoxTable
     has_boxes: bool
+    body: AgentBody | None
 
 
 @register_dataset(
@@ -143,6 +147,7 @@ class FolderRecording(RecordingReader):
             int(agent.timestamp_ns[row]),
             0.0 if agent.speed_mps is None else float(agent.speed_mps[row]),
             agent.id < 0,
+            agent.body,
         )
 
     def _height(self, agent: AgentTable, row: int) -> float:
@@ -201,7 +206,15 @@ def _read_agent(folder: Path, id: int, scenario: str, problems: list[str], missi
         optional["sensor_height_m"],
         BoxTable.read(folder / BOXES) if has_boxes else BoxTable.empty(),
         has_boxes,
+        _body(table),
     )
+
+
+def _body(table: Table) -> AgentBody | None:
+    """Return the body that the first row states; None where the table has no such columns."""
+    if _BODY[0] not in table.names or not table.rows:
+        return None
+    return make_body(table.path, "body_x to body_height", table.numbers(*_BODY)[0].tolist())
 
 
 def _find_clouds(folder: Path, table: Table, time: np.ndarray) -> list[Path]:

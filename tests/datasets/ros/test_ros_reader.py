@@ -237,6 +237,18 @@ def test_intensities_are_divided_by_the_stated_maximum(tmp_path: Path) -> None:
     assert open_recording(tmp_path).snapshot("a", 0).frames[0].points.intensity.unique().tolist() == [0.5]
 
 
+def test_the_body_of_the_vehicle_is_in_the_frame(tmp_path: Path) -> None:
+    settings = write_drive(tmp_path / "a") / "ros.toml"
+    text = settings.read_text()
+    settings.write_text(text.replace("id = 4\n", "id = 4\nbody = [0.4, -0.1, 4.6, 1.9, 1.5]\n"))
+    ego, unit = open_recording(tmp_path).snapshot("a", 0).frames
+    assert unit.body is None and ego.body is not None
+    assert (ego.body.center, ego.body.size) == ((0.4, -0.1, 0.75), (4.6, 1.9, 1.5))
+    settings.write_text(text.replace("id = 4\n", "id = 4\nbody = [0.4, -0.1, 4.6, -1.9, 1.5]\n"))
+    with pytest.raises(RecordingError, match=r"ros\.toml: agent\[0\]\.body is no body"):
+        open_recording(tmp_path)
+
+
 def test_without_boxes_there_is_no_truth_and_without_a_height_it_is_found(tmp_path: Path) -> None:
     settings = write_drive(tmp_path / "a") / "ros.toml"
     text = settings.read_text().replace('boxes = "boxes.csv"\n', "").replace("sensor_height_m = 1.7\n", "")

@@ -132,7 +132,9 @@ class RosbagRecording(RecordingReader):
         height = self._heights[key] if topics.sensor_height_m is None else topics.sensor_height_m
         world_from_lidar = world_from_body @ topics.body_from_lidar
         speed = self._speed(scenario, agent, time)
-        return make_lidar_frame(cloud, world_from_lidar, height, topics.id, time, speed, topics.is_infrastructure)
+        return make_lidar_frame(
+            cloud, world_from_lidar, height, topics.id, time, speed, topics.is_infrastructure, topics.body
+        )
 
     def _speed(self, scenario: str, agent: int, timestamp_ns: int) -> float:
         """Return metres per second between 50 ms before and after, or as near as poses are known; 0 without two poses."""

@@ -3,9 +3,10 @@
 
 Keys at the top: ``bags`` (a list of paths in the folder of the file: rosbag2 folders, ``.mcap``, ``.db3`` or ``.bag``),
 ``max_pose_gap_ms`` (200: two poses farther apart are not interpolated). One table ``[[agent]]`` for each, the ego first: ``id``,
-``points`` (topic), then ``pose`` (topic) or ``tf`` (names of the world's and the LiDAR's frame); optional ``body_from_lidar``
+``points`` (topic), then ``pose`` (topic) or ``tf`` (names of the world's and the LiDAR's frame). Optional: ``body_from_lidar``
 (x, y, z, roll, pitch, yaw of the LiDAR in the frame of the pose), ``sensor_height_m``, ``is_infrastructure`` (id below 0),
-``intensity_max`` (255), ``boxes`` (a table as in plain folders).
+``intensity_max`` (255), ``boxes`` (a table as in plain folders), ``body`` (x, y of the middle of the vehicle's body ahead and to
+the left of the LiDAR, then its length, width, height).
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from typing import Any
 import torch
 
 from manyeyes._io import read_file
-from manyeyes.datatypes import RecordingError, Transform
+from manyeyes.datasets.lidar_frame import make_body
+from manyeyes.datatypes import AgentBody, RecordingError, Transform
 from manyeyes.datatypes.errors import shorten
 
 SETTINGS = "ros.toml"
@@ -41,6 +43,7 @@ class AgentTopics:
     is_infrastructure: bool
     intensity_max: float | None
     boxes: Path | None
+    body: AgentBody | None
 
 
 @dataclass(frozen=True)
@@ -120,11 +123,13 @@ def _read_agent(path: Path, content: Any, where: str) -> AgentTopics:
     is_infrastructure = keys.take("is_infrastructure", lambda v: isinstance(v, bool), "true or false", id < 0)
     intensity_max = keys.take("intensity_max", _is_positive, "a number above 0", None)
     boxes = keys.take("boxes", _is_name, "the name of a table", None)
+    body = keys.take("body", lambda v: _is_numbers(v, 5), "five numbers x, y, length, width, height", None)
     keys.finish()
     values = torch.tensor([float(v) for v in mount], dtype=torch.float64)
     return AgentTopics(
         id, points, pose, None if tf is None else (tf[0], tf[1]), Transform.from_rpy(values[:3], *values[3:]),
         height, is_infrastructure, intensity_max, None if boxes is None else path.parent / boxes,
+        None if body is None else make_body(path, f"{where}.body", [float(v) for v in body]),
     )  # fmt: skip
 
 
