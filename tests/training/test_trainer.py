@@ -213,3 +213,16 @@ def test_a_full_disk_at_a_save_names_the_state_and_keeps_the_last_one(tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
     assert error.value.filename == str(run.path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {"last.pt": before}
+
+
+def test_a_state_that_is_older_than_a_field_of_the_configuration_goes_on(tmp_path):
+    run = Trainer(LineTask(CONFIG), tmp_path)
+    run.advance()
+    run.save()
+    state = torch.load(run.path, weights_only=True)
+    stored = json.loads(state["config"])
+    del stored["micro_batch"]
+    torch.save({**state, "config": json.dumps(stored)}, run.path)
+    assert Trainer(LineTask(CONFIG), tmp_path).step == 1
+    with pytest.raises(CheckpointError, match="belongs to a run of another configuration"):
+        Trainer(LineTask(replace(CONFIG, micro_batch=2)), tmp_path)

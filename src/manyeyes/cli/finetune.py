@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from manyeyes._bounds import Fraction, LearningRate, OutputFolder, PositiveInt, Seed, WorkerCount
+from manyeyes.cli.compute_options import ComputeOptions
 from manyeyes.studies.replay_options import FileChecks
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from manyeyes.datasets.base import Recording
     from manyeyes.evaluation.detection.benchmark import BenchmarkResult
     from manyeyes.training.detector.plan import TrainPlan
+    from manyeyes.training.devices import Execution
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,8 @@ class Options:
     """Of samples, augmentation and the codebook."""
     threads: WorkerCount = 1
     """Threads of torch; the result is the same only for the same number."""
+    compute: ComputeOptions = field(default_factory=ComputeOptions)
+    """Where and how steps are computed."""
     checks: FileChecks = field(default_factory=FileChecks)
     """What is done about missing files."""
 
@@ -61,13 +65,14 @@ def main(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes._lock import hold_folder
+    from manyeyes.training.devices import Execution, resolve_device
 
     torch.set_num_threads(options.threads)
     with hold_folder(options.out):
-        _finetune(options, Console())
+        _finetune(options, Execution(resolve_device(options.compute.device)), Console())
 
 
-def _finetune(options: Options, console: Console) -> None:
+def _finetune(options: Options, execution: Execution, console: Console) -> None:
     import time
 
     from manyeyes.datasets.base import iter_eval_frames
@@ -84,6 +89,7 @@ def _finetune(options: Options, console: Console) -> None:
     console.print(f"{num_frames} frames for training, {num_held} held out; {steps} steps", highlight=False)
     with pretrained.open_detector_file(options.weights) as start, make_progress_bars(console) as bars:
         plan = make_finetune_plan(checkpoint.load(start).config, steps, options.learning_rate, options.codebook)
+        plan = plan.change_stages(micro_batch=options.compute.micro_batch)
         origin = provenance.collect_provenance({"options": options, "training": plan}, options.seed)
         card: dict[str, Any] = {name: origin[name] for name in ("command", "versions", "git_commit")}
         card |= {"finetuned_from": options.weights, "data": [str(path) for path in options.data]}
@@ -93,7 +99,7 @@ def _finetune(options: Options, console: Console) -> None:
             bars.update(row, completed=at.step, description=f"loss {at.loss:.3f}")
 
         began = time.process_time()
-        weights = PlanRun(plan, training, options.seed, options.out, start, holdout).run(card, report)
+        weights = PlanRun(plan, training, options.seed, options.out, start, holdout, execution).run(card, report)
         cpu_minutes = (time.process_time() - began) / 60
     with console.status("Evaluating the holdout before and after"):
         results = _evaluate(holdout, (options.weights, weights), options.max_frames)

@@ -9,14 +9,13 @@ Several processes: torchrun -m manyeyes.cli.main train.
 from __future__ import annotations
 
 import hashlib
-import os
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
-from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from manyeyes._bounds import BatchSize, LearningRate, OutputFolder, PositiveFloat, PositiveInt, Seed, WorkerCount
+from manyeyes.cli.compute_options import ComputeOptions
 from manyeyes.studies.replay_options import FileChecks
 
 if TYPE_CHECKING:
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
     from manyeyes.datasets.missing import MissingFiles
     from manyeyes.models.detector.protocols import BoxDetector
     from manyeyes.training.detector.plan import TrainPlan
+    from manyeyes.training.devices import Execution
     from manyeyes.training.maps.task import MapTask, MapTrainConfig
     from manyeyes.training.pose.feakm import FeakmTask, FeakmTrainConfig
     from manyeyes.training.pose.feakm_cache import FeatureCache
@@ -71,6 +71,8 @@ class Options:
     view they match, a shipped one by default."""
     threads: WorkerCount = 1
     """Threads of torch in each process; the result is the same only for the same number."""
+    compute: ComputeOptions = field(default_factory=ComputeOptions)
+    """Where and how steps are computed."""
     checks: FileChecks = field(default_factory=FileChecks)
     """What is done about missing files."""
 
@@ -82,20 +84,14 @@ def main(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes._lock import hold_folder
+    from manyeyes.training.devices import Execution, open_device
 
     chosen, out = choose_preset(options), options.out or Path("runs") / options.preset
     torch.set_num_threads(options.threads)
-    is_distributed = int(os.environ.get("WORLD_SIZE", "1")) > 1
-    if is_distributed:
-        # Between stages of a plan the others wait for the first, which fits the codebook and calibrates.
-        dist.init_process_group("gloo", timeout=timedelta(hours=12))
-    is_first = not is_distributed or dist.get_rank() == 0
-    try:
+    with open_device(options.compute.device) as device:
+        is_first = not dist.is_initialized() or dist.get_rank() == 0
         with hold_folder(out) if is_first else nullcontext():
-            _train(options, chosen, out, Console(quiet=not is_first))
-    finally:
-        if is_distributed:
-            dist.destroy_process_group()
+            _train(options, chosen, out, Execution(device), Console(quiet=not is_first))
 
 
 def choose_preset(options: Options) -> TrainConfig | TrainPlan:
@@ -115,6 +111,7 @@ def choose_preset(options: Options) -> TrainConfig | TrainPlan:
     if len(options.weights) > 1 and not isinstance(chosen, MapTrainConfig):
         raise ConfigError(f"--weights takes one file for {options.preset}; got {len(options.weights)}.")
     given = {name: getattr(options, name) for name in ("steps", "batch", "learning_rate")}
+    given["micro_batch"] = options.compute.micro_batch
     given = {name: value for name, value in given.items() if value is not None}
     if options.preset in TRAINING_PRESETS:
         return _change_config(TRAINING_PRESETS[options.preset], options.fusion, given)
@@ -143,7 +140,9 @@ def _with_fusion(config: _Config, fusion: str) -> _Config:
     return replace(config, detector=replace(config.detector, fusion=fusion))
 
 
-def _train(options: Options, chosen: TrainConfig | TrainPlan, out: Path, console: Console) -> None:
+def _train(
+    options: Options, chosen: TrainConfig | TrainPlan, out: Path, execution: Execution, console: Console
+) -> None:
     from manyeyes._io import remove_unfinished
     from manyeyes.datasets.mixed import open_recordings
     from manyeyes.studies.map_recordings import check_images
@@ -161,9 +160,9 @@ def _train(options: Options, chosen: TrainConfig | TrainPlan, out: Path, console
         remove_unfinished(out, below=isinstance(chosen, TrainPlan))
     with make_progress_bars(console) as bars:
         if isinstance(chosen, TrainPlan):
-            run = _train_plan(options, chosen, out, recording, bars)
+            run = _train_plan(options, chosen, out, execution, recording, bars)
         else:
-            run = _train_stage(options, chosen, out, recording, missing, bars)
+            run = _train_stage(options, chosen, out, execution, recording, missing, bars)
     if not console.quiet:
         _write_record(options, run, missing, out, console)
 
@@ -207,6 +206,7 @@ def _train_stage(
     options: Options,
     config: TrainConfig,
     out: Path,
+    execution: Execution,
     recording: RecordingReader,
     missing: MissingFiles,
     bars: ProgressBars,
@@ -215,7 +215,7 @@ def _train_stage(
 
     task = _make_task(options, config, recording, missing, bars)
     card = _make_card(options, task.config)
-    trainer = Trainer(task, out)
+    trainer = Trainer(task, out, execution.device)
     row = bars.add_task("Training", total=task.steps)
 
     def report(at: Progress) -> None:
@@ -227,7 +227,12 @@ def _train_stage(
 
 
 def _train_plan(
-    options: Options, plan: TrainPlan, out: Path, recording: RecordingReader, bars: ProgressBars
+    options: Options,
+    plan: TrainPlan,
+    out: Path,
+    execution: Execution,
+    recording: RecordingReader,
+    bars: ProgressBars,
 ) -> _FinishedRun:
     """Run what is left of a plan, with a progress bar for each stage that is trained now."""
     from contextlib import ExitStack
@@ -252,7 +257,8 @@ def _train_plan(
         start = files.enter_context(pretrained.open_detector_file(given)) if given else None
         card = {**_make_card(options, plan), "preset": options.preset, "data": [str(path) for path in options.data]}
         validation = open_recordings(options.validation, options.validation_split) if options.validation else None
-        weights = PlanRun(plan, recording, options.seed, out, start, validation).run(card, report)
+        run = PlanRun(plan, recording, options.seed, out, start, validation, execution)
+        weights = run.run(card, report)
     seconds = checkpoint.read_card(weights)["train_seconds"]
     folders = tuple(out / name for name, _ in plan.stages if (out / name / "log.jsonl").exists())
     return _FinishedRun(plan, weights, last.loss if last else None, seconds, folders)

@@ -298,7 +298,7 @@ class Trainer(Generic[Model, Sample]):
             raise CheckpointError(
                 f"{self.path}: not a whole training state ({type(error).__name__}); delete it to start again."
             ) from error
-        if {name: state.get(name, "") for name in self._name} != self._name:
+        if not self._is_mine(state):
             raise CheckpointError(
                 f"{self.path}: belongs to a run of another configuration or seed, or that began from other weights; give another "
                 "--out, or delete it."
@@ -307,6 +307,15 @@ class Trainer(Generic[Model, Sample]):
         self.average.load_state_dict(state["average"])
         load_optimiser(self.optimiser, state["optimiser"])
         self.step, self.seconds, self.loss = state["step"], state["seconds"], state.get("loss")
+
+    def _is_mine(self, state: dict[str, Any]) -> bool:
+        """Return whether a saved state is of this run; fields that are newer than the state have their defaults."""
+        try:
+            config = checkpoint.config_from_json(type(self.task.config), str(state.get("config")))
+        except (ConfigError, ValueError):
+            return False
+        same = checkpoint.config_to_json(config) == self._name["config"]
+        return same and all(state.get(name, "") == self._name[name] for name in ("seed", "begun"))
 
 
 def warmup_cosine(warmup_steps: int, step: int, steps: int) -> float:

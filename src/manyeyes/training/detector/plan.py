@@ -23,6 +23,7 @@ from manyeyes.models.token_peaks import CARD_KEY
 from manyeyes.training.detector.codebook import attach_codebook, fit_codebook
 from manyeyes.training.detector.score_calibration import calibrate_detector
 from manyeyes.training.detector.task import DetectorTask, DetectorTrainConfig
+from manyeyes.training.devices import Execution
 from manyeyes.training.trainer import Progress, Trainer
 
 WEIGHTS = "weights.safetensors"
@@ -91,6 +92,7 @@ class PlanRun:
         folder: of the run.
         start: weights file that the first stage begins from.
         validation: recording that scores are calibrated on; None leaves them as they are.
+        execution: how stages are computed; the codebook and calibration are computed on the CPU.
     """
 
     plan: TrainPlan
@@ -99,6 +101,7 @@ class PlanRun:
     folder: Path
     start: Path | None = None
     validation: Recording | None = None
+    execution: Execution = Execution()
 
     def run(self, card: dict[str, Any] | None = None, report: Report = _report_nothing) -> Path:
         """Run what is left of the plan; returns the file of the final weights.
@@ -133,7 +136,7 @@ class PlanRun:
         if (folder / WEIGHTS).exists():
             _check_stage(folder / WEIGHTS, config, seed, begun)
             return folder / WEIGHTS
-        trainer = Trainer(DetectorTask(config, self.recording, seed, start), folder)
+        trainer = Trainer(DetectorTask(config, self.recording, seed, start), folder, self.execution.device)
         weights = trainer.run({**card, "started_from": begun}, lambda progress: report(name, progress))
         _wait_for_first()
         return weights
