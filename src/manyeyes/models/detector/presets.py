@@ -22,6 +22,12 @@ BASE_GRID = BevGrid(-140.8, -38.4, -5.0, 140.8, 38.4, 6.0)
 
 BASE_SQUARE_GRID = BevGrid(-140.8, -140.8, -5.0, 140.8, 140.8, 6.0)
 
+DAIR_GRID = BevGrid(-102.4, -51.2, -5.0, 102.4, 51.2, 6.0)
+"""Holds the ranges of all protocols on DAIR-V2X: CoSTr's 102.4 m x 102.4 m ahead, CoAlign's, HEAL's and SparseAlign's."""
+
+DAIR_SQUARE_GRID = BevGrid(-102.4, -102.4, -5.0, 102.4, 102.4, 6.0)
+"""Of the input: the roadside unit looks across the vehicle's road."""
+
 COSTR_SMALL = DetectorConfig(
     grid=SMALL_GRID,
     pillars="moments",
@@ -50,6 +56,15 @@ COSTR_OPV2V = DetectorConfig(
 )
 """Range and widths of the paper, with its head stride 8."""
 
+COSTR_V2XSET = replace(COSTR_OPV2V, grid=BASE_GRID)
+"""The same range and widths; heights reach lower and higher, for roadside units and slopes."""
+
+COSTR_DAIR = replace(COSTR_OPV2V, grid=DAIR_SQUARE_GRID, output_range=DAIR_GRID, sweeps=1)
+"""102.4 m ahead and behind, one sweep: pairs of DAIR-V2X are not evenly spaced in time."""
+
+COSTR_V2X_REAL = replace(COSTR_V2XSET, classes=("vehicle", "pedestrian"))
+"""V2X-Real's benchmark has trucks as a third class; here they are vehicles."""
+
 COSTR_TINY = DetectorConfig(
     grid=BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0),
     pillars="moments",
@@ -63,4 +78,12 @@ COSTR_TINY = DetectorConfig(
 )
 """For tests and examples, trains in seconds."""
 
-DETECTORS = {"costr-small": COSTR_SMALL, "costr-base": COSTR_BASE, "costr-opv2v": COSTR_OPV2V, "costr-tiny": COSTR_TINY}
+DETECTORS = {
+    "costr-small": COSTR_SMALL,
+    "costr-base": COSTR_BASE,
+    "costr-opv2v": COSTR_OPV2V,
+    "costr-v2xset": COSTR_V2XSET,
+    "costr-dair": COSTR_DAIR,
+    "costr-v2x-real": COSTR_V2X_REAL,
+    "costr-tiny": COSTR_TINY,
+}

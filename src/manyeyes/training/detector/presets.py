@@ -10,9 +10,12 @@ from manyeyes.datatypes import BevGrid
 from manyeyes.models.detector.presets import (
     BASE_SQUARE_GRID,
     COSTR_BASE,
+    COSTR_DAIR,
     COSTR_OPV2V,
     COSTR_SMALL,
     COSTR_TINY,
+    COSTR_V2X_REAL,
+    COSTR_V2XSET,
     SMALL_GRID,
     SMALL_SQUARE_GRID,
 )
@@ -80,6 +83,9 @@ def _widen(config: DetectorTrainConfig, **changes: Any) -> DetectorTrainConfig:
     return replace(config, detector=replace(config.detector, **grids), prune_warmup_end=0.001, **changes)
 
 
+_PUBLISHED = DetectorTrainConfig(COSTR_OPV2V, epochs=90.0, batch=4, learning_rate=2e-4)
+"""CoSTr, section IV: 80 + 10 epochs at a learning rate of 2e-4; warm-up over 500 steps and a cosine to zero are ours."""
+
 DETECTOR_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {
     "costr-small/stage1": DetectorTrainConfig(
         COSTR_SMALL,
@@ -115,7 +121,10 @@ DETECTOR_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {
     "ablation/se-dast-fast": _BRANCH,
     "ablation/v2x-vit": _branch(fusion="v2x-vit"),
     "ablation/multi-scale": _branch(fusion="multi-scale"),
-    "costr-opv2v": DetectorTrainConfig(COSTR_OPV2V, epochs=90.0, batch=4, learning_rate=2e-4),
+    "costr-opv2v": _PUBLISHED,
+    "costr-v2xset": replace(_PUBLISHED, detector=COSTR_V2XSET),
+    "costr-dair": replace(_PUBLISHED, detector=COSTR_DAIR),
+    "costr-v2x-real": replace(_PUBLISHED, detector=COSTR_V2X_REAL),
     "costr-tiny": DetectorTrainConfig(
         COSTR_TINY,
         steps=60,
@@ -129,8 +138,8 @@ DETECTOR_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {
 """costr-small/stage1 to stage4, each initialised with the weights of the stage before: stage2 adds the wider range, all agents
 and the IoU loss; stage3 adds history, delay, pose errors, packet loss, budgets, and drawn sensors and intensity laws; stage4
 prunes more cells, object by object. costr-base/stage5 and stage6 go on at twice the range. ablation/*: rows of the ablation, each
-trained on from the shipped weights for the same number of steps. costr-opv2v: 80 + 10 epochs as in the paper. costr-tiny: tests
-and examples.
+trained on from the shipped weights for the same number of steps. costr-opv2v, costr-v2xset, costr-dair and
+costr-v2x-real: the published data sets, 80 + 10 epochs as in the paper. costr-tiny: tests and examples.
 """
 
 
