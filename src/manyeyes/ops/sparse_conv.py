@@ -11,7 +11,7 @@ Semantics: cross-correlation as in ``conv2d``; a bias is added to active rows al
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor
@@ -19,6 +19,7 @@ from torch import Tensor
 from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Sites, SparseBev
 from manyeyes.ops._outer_product_kernels import sum_outer_products
 from manyeyes.ops._sparse_conv_kernels import LANES, convolve, panels
+from manyeyes.ops.gathered_conv import gathered_conv
 from manyeyes.ops.sparse_index import (
     NeighbourMap,
     Pairs,
@@ -196,9 +197,12 @@ def _conv(x: Tensor, weight: Tensor, bias: Tensor | None, table: NeighbourMap, r
     # (taps, in, out): one matrix for each tap.
     taps = weight.to(x.dtype).permute(2, 3, 1, 0).reshape(-1, weight.shape[1], weight.shape[0])
     table = table.on(x.device)
+    if x.device.type != "cpu":
+        out = gathered_conv(x, taps, *((table.back, table.index) if reverse else (table.index, table.back)))
+        return out if bias is None else out + bias.to(x.dtype)
     if not torch.is_grad_enabled():
         return _pair_product(x, taps, table, reverse, bias)
-    out: Tensor = _PairProduct.apply(x, taps, table, reverse)  # pyright: ignore[reportAssignmentType]
+    out = cast(Tensor, _PairProduct.apply(x, taps, table, reverse))
     return out if bias is None else out + bias.to(x.dtype)
 
 

@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import scaled_dot_product_attention
+from torch.nn.functional import pad, scaled_dot_product_attention
 
 from manyeyes._jit import F32x2, I64x1, njit
 from manyeyes.datatypes import ConfigError, ShapeError
+from manyeyes.ops.window_plan import WindowGroup, WindowPlan, plan_on_device
 
 BUCKETS = (4, 8, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512)
 _BITS = 20
@@ -98,33 +99,10 @@ def sincos_encoding(u: Tensor, channels: int) -> Tensor:
     return torch.stack((angle.sin(), angle.cos()), -1).flatten(1)
 
 
-@dataclass(frozen=True)
-class WindowGroup:
-    """Windows padded alike: how many, and the slots of each for queries and for keys."""
-
-    windows: int
-    query_slots: int
-    key_slots: int
-
-
-@dataclass(frozen=True, eq=False)
-class WindowPlan:
-    """Where each query and key sits in the padded batches; shared by all layers over one set of tokens.
-
-    query_slot: (slots,) int64, the query in each slot, Nq where empty; query_place: (Nq,) int64, its slot, the number
-    of slots when its window has no key. key_slot, key_place: the same for keys. exact: sum of queries x keys.
-    """
-
-    groups: tuple[WindowGroup, ...]
-    query_slot: Tensor
-    query_place: Tensor
-    key_slot: Tensor
-    key_place: Tensor
-    exact: int
-
-
 def plan_windows(query_window: Tensor, key_window: Tensor, buckets: tuple[int, ...] = BUCKETS) -> WindowPlan:
     """Group windows by the bucket of their larger side; queries (Nq,) and keys (Nk,) by window id, any order."""
+    if query_window.device.type != "cpu" and query_window.shape[0] + key_window.shape[0]:
+        return plan_on_device(query_window, key_window)
     query_order, query_ids, query_count = _runs(query_window)
     key_order, key_ids, key_count = (
         (query_order, query_ids, query_count) if key_window is query_window else _runs(key_window)
@@ -234,8 +212,7 @@ class _GatherRows(torch.autograd.Function):
 
 
 def _take(x: Tensor, index: Tensor) -> Tensor:
-    flat = torch.cat((x.flatten(1), x.new_zeros(1, x[0:1].flatten(1).shape[1])))
-    return flat.index_select(0, index).view(-1, *x.shape[1:])
+    return pad(x.flatten(1), (0, 0, 0, 1)).index_select(0, index).view(-1, *x.shape[1:])
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,14 @@ from manyeyes._bounds import ChannelCount, LayerCount, StageCount
 from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.ops._attention_block_kernels import BlockWeights, run_block
 from manyeyes.ops._window_attention_kernels import attend_in_windows, window_runs
-from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_attention, window_ids, window_places
+from manyeyes.ops.window_attention import (
+    WindowPlan,
+    plan_windows,
+    sincos_encoding,
+    window_attention,
+    window_ids,
+    window_places,
+)
 
 
 @dataclass(frozen=True)
@@ -82,6 +89,9 @@ class WindowBlock(nn.Module):
         ids, offsets = cache[name]
         if self.folded is not None and _plain(features):
             return run_block(features, offsets, window_runs(ids), self.folded)
+        plan, plan_name = None, ("plan", *name)
+        if not _is_compiled(features):
+            plan = cache[plan_name] = cache[plan_name] if plan_name in cache else plan_windows(ids, ids)
         place = (*name, features.shape[1])
         if place not in cache:
             cache[place] = sincos_encoding(offsets, features.shape[1])
@@ -91,7 +101,7 @@ class WindowBlock(nn.Module):
         def split(x: Tensor) -> Tensor:
             return x.view(x.shape[0], self.heads, x.shape[1] // self.heads)
 
-        attended = _attend(split(self.query(placed)), split(self.key(placed)), split(self.value(normed)), ids)
+        attended = _attend(split(self.query(placed)), split(self.key(placed)), split(self.value(normed)), ids, plan)
         features = features + self.out(attended.flatten(1))
         return features + self.ffn(self.norm_ffn(features))
 
@@ -138,16 +148,21 @@ def density_levels(window: Tensor, cells: int, thresholds: tuple[float, float]) 
     return (share > thresholds[0]).long() + (share > thresholds[1]).long()
 
 
-def _attend(query: Tensor, key: Tensor, value: Tensor, ids: Tensor) -> Tensor:
-    """Attention of (N, heads, C / heads) within windows ids (N,)."""
-    if query.device.type == "cpu" and query.dtype == torch.float32:
+def _attend(query: Tensor, key: Tensor, value: Tensor, ids: Tensor, plan: WindowPlan | None) -> Tensor:
+    """Attention of (N, heads, C / heads) within windows ids (N,), in compiled loops without a plan."""
+    if plan is None:
         return attend_in_windows(query, key, value, window_runs(ids))
-    return window_attention(query, key, value, plan_windows(ids, ids))
+    return window_attention(query, key, value, plan)
 
 
 def _plain(x: Tensor) -> bool:
     """Return whether compiled loops apply: no gradient is required, and the tensor is float32 on the CPU."""
-    return not torch.is_grad_enabled() and x.device.type == "cpu" and x.dtype == torch.float32
+    return not torch.is_grad_enabled() and _is_compiled(x)
+
+
+def _is_compiled(x: Tensor) -> bool:
+    """Return whether compiled attention applies, with gradients too."""
+    return x.device.type == "cpu" and x.dtype == torch.float32
 
 
 class WindowTransformer(nn.Module):

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from manyeyes.datatypes import Boxes, Sites
 
-ROUNDS_BETWEEN_CHECKS = 3
+ROUNDS_BETWEEN_CHECKS = 2
 
 
 @dataclass(frozen=True)
