@@ -16,6 +16,7 @@ from manyeyes.training.detector.losses import (
     _gaussian_nll,
     centre_focal,
     head_terms,
+    heads_terms,
     prune_focal,
 )
 from manyeyes.training.detector.targets import TargetConfig, Targets, add_class_heat, assign_targets
@@ -204,3 +205,28 @@ def test_heat_maps_of_classes_have_their_own_centres_and_people_no_kind_of_vehic
     assert float(terms_of(some, people).classification) == 0 and float(terms.classification) > 0
     terms.heat.backward()
     assert heat.grad is not None and bool((heat.grad.abs().sum(0) > 0).all())
+
+
+def test_heads_together_have_the_terms_and_gradients_of_each_alone():
+    truths = [one_box()], [Boxes.cat([one_box(2.0), one_box(-1.0)])], [Boxes.empty()]
+    zeros = [torch.zeros(())] * 3
+    for chosen in ((0, 1), (1, 2), (2, 2)):
+        together, alone = (
+            [(raw(i), assign_targets(SITES, truths[i], TargetConfig())) for i in chosen] for _ in range(2)
+        )
+        for mine, (its, targets) in zip(heads_terms(together, *zeros), alone, strict=True):
+            wanted = head_terms(its, targets, *zeros)
+            for name in ("heat", "shape", "direction", "classification", "sigma", "iou_score", "iou", "velocity"):
+                assert float(getattr(mine, name).detach()) == pytest.approx(
+                    float(getattr(wanted, name).detach()), rel=1e-5
+                )
+            (mine.total(LossConfig(iou=1.0)) + wanted.total(LossConfig(iou=1.0))).backward(retain_graph=True)
+        for (mine, _), (its, _) in zip(together, alone, strict=True):
+            for name in ("heatmap_logit", "offset", "log_size", "axis", "class_logits", "velocity", "iou_logit"):
+                a, b = getattr(mine, name).grad, getattr(its, name).grad
+                assert (a is None and b is None) or torch.allclose(
+                    torch.zeros_like(getattr(mine, name)) if a is None else a,
+                    torch.zeros_like(getattr(its, name)) if b is None else b,
+                    rtol=1e-5,
+                    atol=1e-8,
+                )

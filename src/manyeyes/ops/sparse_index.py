@@ -260,14 +260,22 @@ def neighbours(
     rows, columns = _compute_bordered_shape(out_shape, in_shape, window)
     device, n_in = in_key.device, in_key.shape[0]
     image = torch.full((batch_size * rows * columns,), n_in, dtype=torch.int32, device=device)
-    batch, y, x = split(in_key, in_shape)
-    image[(batch * rows + y + padding) * columns + x + padding] = torch.arange(n_in, dtype=torch.int32, device=device)
-    if out_key is not in_key or stride != 1:
-        batch, y, x = split(out_key, out_shape)
-    first = (batch * rows + y * stride) * columns + x * stride
-    step = torch.arange(kernel, device=device) * dilation
-    taps = (step[:, None] * columns + step).flatten()
+    unpadded, border = _places(in_key, in_shape, (rows, columns)), padding * (columns + 1)
+    image[unpadded + border] = torch.arange(n_in, dtype=torch.int32, device=device)
+    is_same = out_key is in_key and stride == 1
+    first = unpadded if is_same else _places(out_key, out_shape, (rows, columns), stride)
+    steps = range(0, kernel * dilation, dilation)
+    taps = torch.tensor([down * columns + right for down in steps for right in steps], device=device)
     return image.index_select(0, (first[:, None] + taps).flatten()).view(first.shape[0], kernel * kernel)
+
+
+def _places(key: Tensor, shape: tuple[int, int], image: tuple[int, int], stride: int = 1) -> Tensor:
+    """Return the place (N,) of cells, rows and columns times stride, in images of more rows and columns than shape."""
+    line = key.div(shape[1], rounding_mode="floor")
+    batch = line.div(shape[0], rounding_mode="floor")
+    # (batch * rows + y * stride) * columns + x * stride, with y and x written by line and key.
+    place = (key if stride == 1 else key * stride) + line * (stride * (image[1] - shape[1]))
+    return place + batch * (image[1] * (image[0] - stride * shape[0]))
 
 
 def _compute_bordered_shape(out_shape: tuple[int, int], in_shape: tuple[int, int], window: Window) -> tuple[int, int]:

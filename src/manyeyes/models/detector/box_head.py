@@ -100,6 +100,17 @@ class RawBoxes:
         heat = None if self.class_heat is None else self.class_heat.index_select(0, rows)
         return replace(RawBoxes.of(self.to_rows().index_select(0, rows), sites), class_heat=heat, classes=self.classes)
 
+    @classmethod
+    def cat(cls, many: Sequence[RawBoxes]) -> RawBoxes:
+        """Return outputs on one grid each as a batch of all their grids."""
+        grid, keys, size = many[0].sites.grid, list[Tensor](), 0
+        for one in many:
+            keys.append(one.sites.key + size * math.prod(grid.shape))
+            size += one.sites.batch_size
+        raw = cls.of(torch.cat([one.to_rows() for one in many]), Sites(torch.cat(keys), grid, size))
+        heats = [one.class_heat for one in many if one.class_heat is not None]
+        return replace(raw, class_heat=torch.cat(heats) if heats else None, classes=many[0].classes)
+
     def on(self, sites: Sites) -> RawBoxes:
         """Return the same outputs with an equal set of sites, on the device of that set."""
         if self.sites is sites:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import torch
@@ -111,37 +112,63 @@ def prune_focal(pruned: PruneOutput, near: Tensor, num_boxes: int, alpha: float 
 
 def head_terms(raw: RawBoxes, targets: Targets, prune: Tensor, mask_l1: Tensor, information: Tensor) -> LossTerms:
     """Compute all terms of one batch; each is finite, and zero without targets."""
-    heat = _heat_term(raw, targets)
-    rows = (targets.box >= 0).nonzero()[:, 0]
-    if not len(rows):
-        zero = raw.heatmap_logit.sum() * 0
-        return LossTerms(heat, zero, zero, zero, zero, zero, zero, zero, prune, mask_l1, information)
-    some, truth, weight = raw.select(rows), targets.boxes[targets.box[rows]].to(torch.float32), targets.weight[rows]
+    return heads_terms([(raw, targets)], prune, mask_l1, information)[0]
 
-    def mean(value: Tensor) -> Tensor:
-        return (value * weight).sum() / weight.sum()
 
-    offset = (truth.center[:, :2] - some.sites.xy) / some.sites.grid.cell_size_m
-    log_size = (truth.size / truth.size.new_tensor(TYPICAL_SIZE)).log()
-    axis = torch.stack(((2 * truth.yaw).cos(), (2 * truth.yaw).sin()), 1)
-    off = (some.offset - offset).abs().sum(1) + (some.z - truth.center[:, 2]).abs() * 0.2
+def heads_terms(
+    heads: Sequence[tuple[RawBoxes, Targets]], prune: Tensor, mask_l1: Tensor, information: Tensor
+) -> list[LossTerms]:
+    """Compute all terms of the heads of one grid, each with its targets, in one pass over the assigned sites of all."""
+    rest = prune, mask_l1, information
+    heat = [_heat_term(raw, targets) for raw, targets in heads]
+    rows = [(targets.box >= 0).nonzero()[:, 0] for _, targets in heads]
+    sizes = [len(part) for part in rows]
+    if not sum(sizes):
+        zeros = [raw.heatmap_logit.sum() * 0 for raw, _ in heads]
+        return [LossTerms(h, zero, zero, zero, zero, zero, zero, zero, *rest) for h, zero in zip(heat, zeros)]
+    some = RawBoxes.cat([raw.select(part) for (raw, _), part in zip(heads, rows)])
+    truth = torch.cat(
+        [_pack(t.boxes).index_select(0, t.box.index_select(0, part)) for (_, t), part in zip(heads, rows)]
+    )
+    weight = [targets.weight.index_select(0, part) for (_, targets), part in zip(heads, rows)]
+    terms = []
+    for first, part, scale in zip(heat, _row_terms(some, truth).split(sizes, 1), weight):
+        # Without targets the sum is zero, and so is the mean.
+        mean = (part * scale).sum(1) / scale.sum().clamp_min(torch.finfo(scale.dtype).tiny)
+        shape, direction, kind, sigma, overlap, iou, speed = mean.unbind()
+        terms.append(LossTerms(first, shape, direction, kind, sigma, overlap, iou, speed, *rest))
+    return terms
+
+
+def _pack(boxes: Boxes) -> Tensor:
+    """Return (M, 10) float32: centre, size, yaw, velocity and label of boxes."""
+    columns = (boxes.center, boxes.size, boxes.yaw[:, None], boxes.velocity, boxes.label[:, None])
+    return torch.cat([column.to(torch.float32) for column in columns], 1)
+
+
+def _row_terms(some: RawBoxes, truth: Tensor) -> Tensor:
+    """Return (7, n) terms of n sites against their boxes, rows of _pack, in the order of LossTerms from shape on."""
+    center, size, yaw, velocity, label = truth.split((3, 3, 1, 2, 1), 1)
+    yaw, cell = yaw[:, 0], some.sites.grid.cell_size_m
+    offset = (center[:, :2] - some.sites.xy) / cell
+    log_size = (size / size.new_tensor(TYPICAL_SIZE)).log()
+    axis = torch.stack(((2 * yaw).cos(), (2 * yaw).sin()), 1)
+    off = (some.offset - offset).abs().sum(1) + (some.z - center[:, 2]).abs() * 0.2
     shape = off + (some.log_size - log_size).abs().sum(1) + (some.axis - axis).abs().sum(1) * 0.5
     # The axis is known modulo pi; the heading along it is a separate classification.
-    yaw = axis_yaw(some.axis).detach()
-    turn = truth.yaw - yaw
+    turn = yaw - axis_yaw(some.axis).detach()
     ahead = (turn.cos() > 0).float()
     direction = functional.binary_cross_entropy_with_logits(heading_logit(some), ahead, reduction="none")
-    kind = _kind_term(some, truth)
-    sigma = _gaussian_nll(((some.offset - offset) * some.sites.grid.cell_size_m).detach(), some.log_sigma_xy)
+    kind = _kind_term(some, label[:, 0].long())
+    sigma = _gaussian_nll(((some.offset - offset) * cell).detach(), some.log_sigma_xy)
     axis_error = torch.atan2((2 * turn).sin(), (2 * turn).cos())[:, None] / 2
     sigma = sigma + _gaussian_nll(axis_error, some.log_sigma_yaw)
-    iou = aligned_iou(some.bev(), truth.bev())
+    iou = aligned_iou(some.bev(), torch.cat((center[:, :2], size[:, :2], yaw[:, None]), 1))
     overlap = functional.binary_cross_entropy_with_logits(
         some.iou_logit, iou.detach().clamp(0, 1).float(), reduction="none"
     )
-    speed = (some.velocity - truth.velocity / SPEED_UNIT).abs().sum(1)
-    rest = (mean(sigma), mean(overlap), mean(1 - iou), mean(speed), prune, mask_l1, information)
-    return LossTerms(heat, mean(shape), mean(direction), mean(kind), *rest)
+    speed = (some.velocity - velocity / SPEED_UNIT).abs().sum(1)
+    return torch.stack((shape, direction, kind, sigma, overlap, 1 - iou, speed))
 
 
 def _heat_term(raw: RawBoxes, targets: Targets) -> Tensor:
@@ -152,13 +179,13 @@ def _heat_term(raw: RawBoxes, targets: Targets) -> Tensor:
     return torch.stack([centre_focal(*column) for column in columns]).sum()
 
 
-def _kind_term(some: RawBoxes, truth: Boxes) -> Tensor:
+def _kind_term(some: RawBoxes, label: Tensor) -> Tensor:
     """Return the cross-entropy (N,) of the kind of vehicle; 0 of people, whose class is that of their heat map."""
     if some.classes == VEHICLES:
-        return functional.cross_entropy(some.class_logits, truth.label, reduction="none")
+        return functional.cross_entropy(some.class_logits, label, reduction="none")
     last = len(VEHICLE_LABELS) - 1
-    entropy = functional.cross_entropy(some.class_logits, truth.label.clamp_max(last), reduction="none")
-    return torch.where(truth.label <= last, entropy, 0.0)
+    entropy = functional.cross_entropy(some.class_logits, label.clamp_max(last), reduction="none")
+    return torch.where(label <= last, entropy, 0.0)
 
 
 def _gaussian_nll(error: Tensor, log_sigma: Tensor) -> Tensor:

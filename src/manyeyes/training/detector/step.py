@@ -17,7 +17,7 @@ from manyeyes.models.detector.detector import Detector, ExtractedFeatures
 from manyeyes.models.fusion.transform_tokens import AgentTokens, to_ego_frame
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.window_attention import window_ids
-from manyeyes.training.detector.losses import LossTerms, head_terms, prune_focal
+from manyeyes.training.detector.losses import LossTerms, heads_terms, prune_focal
 from manyeyes.training.detector.mutual_information import (
     STUDY_TARGETS,
     WINDOW_CELLS,
@@ -189,10 +189,10 @@ def loss_terms(
     kept, information = mutual_information_loss(out.shared_tokens, out.mask, own.heat)
     if target != "own_task":
         information = STUDY_TARGETS[target](pair_agent_tokens(out, samples))
-    alone = head_terms(out.single_agent_boxes, own, prune, kept, information)
     sites = out.fused_boxes.sites
     both = add_class_heat(assign_targets(sites, union, targets), sites, merged_boxes, classes, targets)
-    fused = head_terms(out.fused_boxes, both, prune, kept, information)
+    heads = (out.single_agent_boxes, own), (out.fused_boxes, both)
+    alone, fused = heads_terms(heads, prune, kept, information)
     return alone.mix(fused, fusion_weight)
 
 
