@@ -75,7 +75,7 @@ class BlockWeights:
         if any(n.eps != _EPS for n in norms) or any(w.out_features % LANES or w.weight.is_cuda for w in linears):
             return None
         tensors = [
-            *(torch.zeros(w.out_features) if w.bias is None else w.bias for w in linears),
+            *(w.weight.new_zeros(w.out_features) if w.bias is None else w.bias for w in linears),
             *(t for n in norms for t in (n.weight, n.bias)),
         ]
         matrices = BlockMatrices(

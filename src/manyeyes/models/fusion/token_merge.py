@@ -43,7 +43,10 @@ class FusedBev:
 def assign_cells(tokens: Tokens) -> tuple[Tensor, Tensor]:
     """Return the key (N,) of the cell of each token, and the token's offset (N, 2) from that cell's centre, in cells."""
     if is_plain(tokens.xy, tokens.proposal):
-        key, cell_offset = torch.empty(len(tokens.xy), dtype=torch.int64), torch.empty(len(tokens.xy), 2)
+        key, cell_offset = (
+            tokens.xy.new_empty(len(tokens.xy), dtype=torch.int64),
+            tokens.xy.new_empty(len(tokens.xy), 2),
+        )
         xy, proposal = tokens.xy.contiguous().numpy(), tokens.proposal.contiguous().numpy()
         votes = (MIN_VOTE_LOGIT, MAX_OFFSET_CELLS)
         grid, ego = grid_cells(tokens.grid), tokens.ego.contiguous().numpy()

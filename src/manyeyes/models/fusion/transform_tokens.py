@@ -175,7 +175,8 @@ def _transform_in_loops(parts: Sequence[AgentTokens], grid: BevGrid, batch_size:
     """As by tensors, without masks."""
     tokens, xy = torch.cat([part.tokens for part in parts]), torch.cat([part.xy for part in parts])
     widths = (tokens.shape[1] - PROPOSAL_DIM, 2, POSE_CONTEXT_DIM, PROPOSAL_DIM)
-    columns, ego = [torch.empty(len(xy), width) for width in widths], torch.empty(len(xy), dtype=torch.int64)
+    columns = [xy.new_empty(len(xy), width) for width in widths]
+    ego = xy.new_empty(len(xy), dtype=torch.int64)
     features, places, context, proposal = (column.numpy() for column in columns)
     out = MovedTokens(features, places, context, proposal, ego.numpy())
     sizes, links = np.array([len(part.xy) for part in parts]), _describe_links(parts).numpy()
@@ -183,7 +184,7 @@ def _transform_in_loops(parts: Sequence[AgentTokens], grid: BevGrid, batch_size:
         tokens.numpy(), xy.numpy(), sizes, links, MAX_SPEED_MPS, PROPOSAL_COLUMNS, grid_cells(grid), out
     )
     features, places, context, proposal = (column[:count] for column in columns)
-    return Tokens(features, places, ego[:count], context, proposal, torch.ones(count), grid, batch_size)
+    return Tokens(features, places, ego[:count], context, proposal, xy.new_ones(count), grid, batch_size)
 
 
 def _describe_links(parts: Sequence[AgentTokens]) -> Tensor:
