@@ -46,6 +46,7 @@ NonNegativeFloat = Annotated[float, Bounds("a finite number of at least 0", 0.0)
 PositiveFloat = Annotated[float, Bounds("a finite number above 0", 5e-324)]
 Fraction = Annotated[float, Bounds("a number from 0 to 1", 0.0, 1.0)]
 WorkerCount = Annotated[int, Bounds("an integer from 1 to 1024", 1, 1024)]
+LoaderCount = Annotated[int, Bounds("an integer from 0 to 1024", 0, 1024)]
 BatchSize = Annotated[int, Bounds("an integer from 1 to 65536", 1, 65_536)]
 PixelCount = Annotated[int, Bounds("an integer from 1 to 16384", 1, 16_384)]
 ByteCount = Annotated[int, Bounds("an integer from 1 to 2**31 - 1", 1, 2**31 - 1)]

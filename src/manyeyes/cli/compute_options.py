@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from manyeyes._bounds import BatchSize
+from manyeyes._bounds import BatchSize, LoaderCount
 
 
 @dataclass(frozen=True)
@@ -14,6 +14,8 @@ class ComputeOptions:
 
     device: str = "auto"
     """auto: a GPU where torch finds one, else the CPU; cpu; cuda or cuda:N. A run can go on on another device."""
+    workers: LoaderCount = 0
+    """Processes that draw samples ahead of the steps; 0 draws them between steps. The result is the same at any number."""
     micro_batch: BatchSize | None = None
     """Samples that a process holds in memory together; gradients accumulate over the parts of its batch. Batch norms see one part
     at a time, so that the result differs from that of the whole batch."""

@@ -69,7 +69,8 @@ def main(options: Options) -> None:
 
     torch.set_num_threads(options.threads)
     with hold_folder(options.out):
-        _finetune(options, Execution(resolve_device(options.compute.device)), Console())
+        execution = Execution(resolve_device(options.compute.device), options.compute.workers)
+        _finetune(options, execution, Console())
 
 
 def _finetune(options: Options, execution: Execution, console: Console) -> None:

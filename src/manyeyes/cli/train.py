@@ -91,7 +91,7 @@ def main(options: Options) -> None:
     with open_device(options.compute.device) as device:
         is_first = not dist.is_initialized() or dist.get_rank() == 0
         with hold_folder(out) if is_first else nullcontext():
-            _train(options, chosen, out, Execution(device), Console(quiet=not is_first))
+            _train(options, chosen, out, Execution(device, options.compute.workers), Console(quiet=not is_first))
 
 
 def choose_preset(options: Options) -> TrainConfig | TrainPlan:
@@ -215,7 +215,7 @@ def _train_stage(
 
     task = _make_task(options, config, recording, missing, bars)
     card = _make_card(options, task.config)
-    trainer = Trainer(task, out, execution.device)
+    trainer = Trainer(task, out, execution.device, execution.workers)
     row = bars.add_task("Training", total=task.steps)
 
     def report(at: Progress) -> None:

@@ -19,9 +19,10 @@ _FORMS = "auto, cpu, cuda or cuda:N"
 
 @dataclass(frozen=True)
 class Execution:
-    """How a run computes; its samples and its order do not depend on it."""
+    """How a run computes; its samples and their order do not depend on it. workers: processes that draw samples ahead."""
 
     device: torch.device = torch.device("cpu")
+    workers: int = 0
 
 
 def resolve_device(name: str = "auto", local_rank: int | None = None) -> torch.device:

@@ -25,6 +25,7 @@ from manyeyes._io import atomic_write, atomic_write_text, flush_files, name_erro
 from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.models import checkpoint
 from manyeyes.training.optimiser import AveragedWeights, clip_gradients, load_optimiser, make_optimiser, to_cpu
+from manyeyes.training.prefetch import prefetch
 
 STEPS_BETWEEN_READS = 10
 """Off the CPU, losses are read, checked and logged every so many steps, and before a save: reading waits for the device."""
@@ -138,13 +139,17 @@ class Trainer(Generic[Model, Sample]):
     write to one folder at once: hold its lock (:func:`manyeyes._lock.hold_folder`), as ``manyeyes train`` does.
 
     device: of the model; samples are drawn on the CPU. The state of a run can be resumed on any device.
+    workers: processes that draw the samples of run ahead of its steps; 0 draws them in this one. The result is the same.
 
     Raises:
         CheckpointError: the folder holds a run of another configuration, seed or initial weights, or a damaged state.
     """
 
-    def __init__(self, task: Task[Any, Model, Sample], folder: Path, device: torch.device | str = "cpu") -> None:
-        self.task, self.folder, self.device = task, folder, torch.device(device)
+    def __init__(
+        self, task: Task[Any, Model, Sample], folder: Path, device: torch.device | str = "cpu", workers: int = 0
+    ) -> None:
+        self.task, self.folder, self.device, self.workers = task, folder, torch.device(device), workers
+        self._draw = task.draw
         self.rank, self.world_size = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
         with torch.random.fork_rng():
             torch.manual_seed(task.seed)
@@ -181,7 +186,8 @@ class Trainer(Generic[Model, Sample]):
         which is saved.
         """
         unread: list[_StepResult] = []
-        with _defer_interrupts() as interrupted:
+        numbers = (n for step in range(self.step, self.task.steps) for n in self._sample_numbers(step))
+        with prefetch(self.task.draw, numbers, self.workers) as self._draw, _defer_interrupts() as interrupted:
             while self.step < self.task.steps:
                 unread.append(self._advance())
                 is_due = not self.step % self.task.config.save_every or self.step == self.task.steps
@@ -195,6 +201,7 @@ class Trainer(Generic[Model, Sample]):
                     self.save()
                 if interrupted.is_set():
                     raise KeyboardInterrupt
+        self._draw = self.task.draw
         weights = self.folder / "weights.safetensors"
         if not self.rank:
             about = {"seed": self.task.seed, "steps": self.task.steps, **self.task.finish(self.average)}
@@ -209,12 +216,12 @@ class Trainer(Generic[Model, Sample]):
     def _advance(self) -> _StepResult:
         """Run one optimiser step without waiting for what it measures."""
         config, began = self.task.config, time.monotonic()
-        numbers = self._sample_numbers(config.batch)
+        numbers = self._sample_numbers(self.step)
         self.model.train()
         total: Tensor | None = None
         names: tuple[str, ...] = ()
         for part in _split(numbers, config.micro_batch or len(numbers)):
-            samples = [self.task.draw(number) for number in part]
+            samples = [self._draw(number) for number in part]
             loss, terms = self.task.loss(self.model, samples, part, self.step)
             fraction = len(part) / len(numbers)
             names = tuple(terms)
@@ -263,12 +270,13 @@ class Trainer(Generic[Model, Sample]):
         with name_errors(self.log_path), self.log_path.open("a", encoding="utf-8") as log:
             log.write(json.dumps(progress.to_record()) + "\n")
 
-    def _sample_numbers(self, batch: int) -> range:
-        """Return the sample numbers of this process for the next step."""
+    def _sample_numbers(self, step: int) -> range:
+        """Return the sample numbers of this process for a step."""
+        batch = self.task.config.batch
         if batch % self.world_size:
             raise ConfigError(f"A batch of {batch} samples cannot be shared by {self.world_size} processes evenly.")
         count = batch // self.world_size
-        first = self.step * batch + self.rank * count
+        first = step * batch + self.rank * count
         return range(first, first + count)
 
     def _optimiser_step(self, rate: float) -> None:

@@ -100,7 +100,7 @@ class PillarEncoder(nn.Module):
         numbers = [cloud.xyz.new_full((len(cloud),), agent, dtype=torch.int64) for cloud, agent in zip(many, agents)]
         parts = ([cloud.xyz for cloud in many], [cloud.intensity for cloud in many], numbers)
         # The clouds of a batch become three tensors first, so that three copies bring them to the device.
-        xyz, intensities, batch = (_concatenate(part).to(device, non_blocking=True) for part in parts)
+        xyz, intensities, batch = (_move(_concatenate(part), device) for part in parts)
         pillars = pillar_sites(xyz, batch, self.grid, len(clouds))
         kept = pillars.inside.nonzero()[:, 0]
         is_previous = kept >= sum(map(len, clouds))
@@ -112,6 +112,12 @@ class PillarEncoder(nn.Module):
 def _plain(clouds: list[PointCloud]) -> bool:
     """Return whether compiled loops can read these tensors."""
     return all(cloud.xyz.dtype == torch.float32 and cloud.xyz.device.type == "cpu" for cloud in clouds)
+
+
+def _move(rows: Tensor, device: torch.device) -> Tensor:
+    """Bring rows to the device of the weights; from pinned memory to a GPU, so that the host does not wait."""
+    pinned = rows.pin_memory() if device.type == "cuda" and not rows.is_cuda and torch.cuda.is_available() else rows
+    return pinned.to(device, non_blocking=True)
 
 
 def _concatenate(parts: list[Tensor]) -> Tensor:

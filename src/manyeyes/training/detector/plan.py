@@ -136,7 +136,8 @@ class PlanRun:
         if (folder / WEIGHTS).exists():
             _check_stage(folder / WEIGHTS, config, seed, begun)
             return folder / WEIGHTS
-        trainer = Trainer(DetectorTask(config, self.recording, seed, start), folder, self.execution.device)
+        task, execution = DetectorTask(config, self.recording, seed, start), self.execution
+        trainer = Trainer(task, folder, execution.device, execution.workers)
         weights = trainer.run({**card, "started_from": begun}, lambda progress: report(name, progress))
         _wait_for_first()
         return weights
