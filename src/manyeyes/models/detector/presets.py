@@ -26,7 +26,7 @@ DAIR_GRID = BevGrid(-102.4, -51.2, -5.0, 102.4, 51.2, 6.0)
 """Holds the ranges of all protocols on DAIR-V2X: CoSTr's 102.4 m x 102.4 m ahead, CoAlign's, HEAL's and SparseAlign's."""
 
 DAIR_SQUARE_GRID = BevGrid(-102.4, -102.4, -5.0, 102.4, 102.4, 6.0)
-"""Of the input: the roadside unit looks across the vehicle's road."""
+"""Of the input: the roadside unit faces across the vehicle's road."""
 
 COSTR_SMALL = DetectorConfig(
     grid=SMALL_GRID,
