@@ -17,6 +17,7 @@ from manyeyes.datatypes import (
     KINDS,
     LABELS,
     STYLES,
+    AgentBody,
     AgentFrame,
     BevGrid,
     Boxes,
@@ -115,6 +116,10 @@ def make_snapshot(boxes: Boxes, first: AgentFrame, second: AgentFrame) -> Snapsh
 
 
 st.register_type_strategy(BevGrid, st.just(GRID))
+BODY_CENTER, BODY_SIZE = st.floats(-20, 20, width=32), st.floats(0.125, 25, width=32)
+st.register_type_strategy(
+    AgentBody, st.builds(AgentBody, st.tuples(*[BODY_CENTER] * 3), st.tuples(*[BODY_SIZE] * 3), ANGLES)
+)
 st.register_type_strategy(Transform, st.builds(make_transform, OFFSETS, OFFSETS, OFFSETS, ANGLES, ANGLES, ANGLES))
 st.register_type_strategy(Boxes, st.builds(make_boxes, SEEDS, COUNTS, st.sampled_from((torch.float32, torch.float64))))
 st.register_type_strategy(PointCloud, st.builds(make_cloud, SEEDS, COUNTS))

@@ -62,6 +62,10 @@ train --data {{rec}} --steps 0 | --steps
 train --data {{rec}} --learning-rate -1 | --learning-rate
 train --data {{rec}} --learning-rate inf | --learning-rate
 train --data {{rec}} --learning-rate 1e30 | --learning-rate
+finetune --data {{rec}} --holdout 1.5 | --holdout
+finetune --data {{rec}} --max-frames 0 | --max-frames
+calibrate --data {{rec}} --weights costr-small --out x.safetensors --max-frames 0 | --max-frames
+check {{rec}} --scenarios 0 | --scenarios
 evaluate --data {{rec}} --workers 0 | --workers
 evaluate --data {{rec}} --workers {HUGE} | --workers
 evaluate --data {{rec}} --noise-xy-m nan | --noise-xy-m
@@ -96,6 +100,8 @@ study fusion --observation-counts 0 | --observation-counts
 study adversarial --seeds -1 | --seeds
 study crowdmap-table3 --workers 0 | --workers
 study num-agents --data {{rec}} --seed -1 | --seed
+study sensors --data {{rec}} --seed -1 | --seed
+study strata --data {{rec}} --seed -1 | --seed
 study local --data {{rec}} --scenario-stride 0 | --scenario-stride
 study tuning --workers 0 | --workers
 """
@@ -120,6 +126,9 @@ evaluate --data {rec} --split test --methods intermedite | intermediate
 replay {rec} --split test --scenario zzz | zzz
 replay {rec} --split test --weights {weights} --scenario aa --frame 1000000 | 1000000
 view {rec} --split test --frame 99 | 99
+check {missing} | {missing}
+check {rec} --split test --weights {missing}.safetensors | {missing}.safetensors
+finetune --data {rec} --split nosuch | nosuch
 view {rec} --split test --detect lat | late
 pose {rec} --split test --correctors votin | voting
 pose {rec} --split test --correctors | --correctors
