@@ -14,7 +14,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from manyeyes._bounds import BatchSize, LearningRate, OutputFolder, PositiveFloat, PositiveInt, Seed, WorkerCount
+from manyeyes._bounds import (
+    BatchSize,
+    InputPath,
+    LearningRate,
+    OutputFolder,
+    PositiveFloat,
+    PositiveInt,
+    Seed,
+    WorkerCount,
+)
 from manyeyes.cli.compute_options import ComputeOptions
 from manyeyes.studies.replay_options import FileChecks
 
@@ -39,7 +48,7 @@ _Config = TypeVar("_Config", bound="TrainConfig")
 class Options:
     """Which recordings, which settings, where to."""
 
-    data: tuple[Path, ...]
+    data: tuple[Path, ...] = ()
     """Data sets, folders of scenarios, or single scenarios: OPV2V, DAIR-V2X, Argoverse 2, or the layout of a registered reader.
     Several are mixed: samples are uniform over the scenarios of all."""
     split: str | None = "train"
@@ -52,6 +61,10 @@ class Options:
     """Which split of every recording of validation."""
     preset: str = "costr-small/stage1"
     """Settings by name, of a stage or of a plan of stages; an unknown name lists the known ones."""
+    config: InputPath | None = None
+    """TOML file with any fields of the preset's settings, which replace them; the options of this command replace both."""
+    print_config: bool = False
+    """Print the settings as such a file, and train nothing."""
     out: OutputFolder | None = None
     """Folder of the run, runs/PRESET by default: weights.safetensors, log.jsonl, loss.png, train.json, last.pt to go on from;
     of a plan one such folder for each stage, and the final weights.safetensors."""
@@ -84,9 +97,16 @@ def main(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes._lock import hold_folder
+    from manyeyes.datatypes import ConfigError
+    from manyeyes.training.config_file import print_config
     from manyeyes.training.devices import Execution, open_device
 
     chosen, out = choose_preset(options), options.out or Path("runs") / options.preset
+    if options.print_config:
+        print(print_config(chosen), end="")
+        return
+    if not options.data:
+        raise ConfigError("--data is missing: name the recordings to train on.")
     torch.set_num_threads(options.threads)
     with open_device(options.compute.device) as device:
         is_first = not dist.is_initialized() or dist.get_rank() == 0
@@ -98,9 +118,12 @@ def choose_preset(options: Options) -> TrainConfig | TrainPlan:
     """Return the configuration or the plan of the preset with what the options replace.
 
     Raises:
-        ConfigError: the preset is unknown, takes only one file of weights, or has no fusion module.
+        ConfigError: the preset is unknown, the file of settings does not fit it, or it takes one file of weights or has no
+            fusion module.
     """
     from manyeyes.datatypes import ConfigError
+    from manyeyes.training.config_file import read_config
+    from manyeyes.training.detector.plan import TrainPlan
     from manyeyes.training.maps.task import MapTrainConfig
     from manyeyes.training.presets import TRAINING_PLANS, TRAINING_PRESETS
 
@@ -108,14 +131,16 @@ def choose_preset(options: Options) -> TrainConfig | TrainPlan:
     if chosen is None:
         known = ", ".join((*TRAINING_PLANS, *TRAINING_PRESETS))
         raise ConfigError(f"No training preset {options.preset!r}; choose one of {known}.")
+    if options.config is not None:
+        chosen = read_config(options.config, chosen)
     if len(options.weights) > 1 and not isinstance(chosen, MapTrainConfig):
         raise ConfigError(f"--weights takes one file for {options.preset}; got {len(options.weights)}.")
     given = {name: getattr(options, name) for name in ("steps", "batch", "learning_rate")}
     given["micro_batch"] = options.compute.micro_batch
     given = {name: value for name, value in given.items() if value is not None}
-    if options.preset in TRAINING_PRESETS:
-        return _change_config(TRAINING_PRESETS[options.preset], options.fusion, given)
-    plan = TRAINING_PLANS[options.preset]
+    if not isinstance(chosen, TrainPlan):
+        return _change_config(chosen, options.fusion, given)
+    plan = chosen
     stages = ((name, _change_config(config, options.fusion, given)) for name, config in plan.stages)
     released = (
         plan.released
