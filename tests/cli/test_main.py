@@ -128,7 +128,15 @@ def test_doctor_names_damaged_weights_and_exits_with_1(monkeypatch, capsys, tmp_
     assert cli.main(["doctor", "--json"]) == 1
     output = capsys.readouterr()
     statuses = {status["name"]: status for status in json.loads(output.out)["weights"]}
-    assert set(statuses) == {"costr-small", "feakm-small", "map-small-camera", "map-small-fusion", "map-small-lidar"}
+    expected = {
+        "costr-sensors",
+        "costr-small",
+        "feakm-small",
+        "map-small-camera",
+        "map-small-fusion",
+        "map-small-lidar",
+    }
+    assert set(statuses) == expected
     assert f"1,000 bytes instead of {len(whole):,}" in statuses["costr-small"]["problem"]
     assert "No such file" in statuses["feakm-small"]["problem"]
     assert output.err.startswith(f"manyeyes: {folder}") and output.err.count("\n") == 1
