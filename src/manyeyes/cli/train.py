@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from manyeyes.training.pose.feakm_cache import FeatureCache
     from manyeyes.training.trainer import Task, TrainConfig
 
+_REPLACED = ("steps", "batch", "learning_rate", "validate_every", "validate_frames")
+"""Options that replace fields of the settings of every stage."""
 _Config = TypeVar("_Config", bound="TrainConfig")
 
 
@@ -56,7 +58,12 @@ class Options:
     data_weights: tuple[PositiveFloat, ...] = ()
     """Probability that a sample comes from each of the recordings, up to a common factor, instead of by numbers of scenarios."""
     validation: tuple[Path, ...] = ()
-    """Recordings that a plan calibrates scores on, whose frames are in no training; without any, scores stay as they are."""
+    """Recordings whose frames are in no training: a plan calibrates scores on them, and weights are measured on them during
+    training where --validate-every is given."""
+    validate_every: PositiveInt | None = None
+    """Steps between two measurements of AP@0.5 on frames of validation; the result is then the best weights, best.safetensors."""
+    validate_frames: PositiveInt | None = None
+    """Frames of a measurement at most, spread evenly, instead of the preset's 40."""
     validation_split: str | None = "val"
     """Which split of every recording of validation."""
     preset: str = "costr-small/stage1"
@@ -135,7 +142,7 @@ def choose_preset(options: Options) -> TrainConfig | TrainPlan:
         chosen = read_config(options.config, chosen)
     if len(options.weights) > 1 and not isinstance(chosen, MapTrainConfig):
         raise ConfigError(f"--weights takes one file for {options.preset}; got {len(options.weights)}.")
-    given = {name: getattr(options, name) for name in ("steps", "batch", "learning_rate")}
+    given = {name: getattr(options, name) for name in _REPLACED}
     given["micro_batch"] = options.compute.micro_batch
     given = {name: value for name, value in given.items() if value is not None}
     if not isinstance(chosen, TrainPlan):
@@ -262,7 +269,6 @@ def _train_plan(
     """Run what is left of a plan, with a progress bar for each stage that is trained now."""
     from contextlib import ExitStack
 
-    from manyeyes.datasets.mixed import open_recordings
     from manyeyes.models import checkpoint, pretrained
     from manyeyes.training.detector.plan import PlanRun
     from manyeyes.training.trainer import Progress
@@ -281,12 +287,18 @@ def _train_plan(
         given = next(iter(map(str, options.weights)), plan.start)
         start = files.enter_context(pretrained.open_detector_file(given)) if given else None
         card = {**_make_card(options, plan), "preset": options.preset, "data": [str(path) for path in options.data]}
-        validation = open_recordings(options.validation, options.validation_split) if options.validation else None
+        validation = _open_validation(options)
         run = PlanRun(plan, recording, options.seed, out, start, validation, execution)
         weights = run.run(card, report)
     seconds = checkpoint.read_card(weights)["train_seconds"]
     folders = tuple(out / name for name, _ in plan.stages if (out / name / "log.jsonl").exists())
     return _FinishedRun(plan, weights, last.loss if last else None, seconds, folders)
+
+
+def _open_validation(options: Options) -> RecordingReader | None:
+    from manyeyes.datasets.mixed import open_recordings
+
+    return open_recordings(options.validation, options.validation_split) if options.validation else None
 
 
 def _make_task(
@@ -297,7 +309,8 @@ def _make_task(
     from manyeyes.training.pose.feakm import FeakmTrainConfig
 
     if isinstance(config, DetectorTrainConfig):
-        return DetectorTask(config, recording, options.seed, *options.weights)
+        start = next(iter(options.weights), None)
+        return DetectorTask(config, recording, options.seed, start, _open_validation(options))
     if isinstance(config, MapTrainConfig):
         return _make_map_task(options, config, recording)
     assert isinstance(config, FeakmTrainConfig)

@@ -13,7 +13,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -49,6 +49,8 @@ class TrainConfig:
         ema_decay: decay of the averaged weights, which are saved.
         micro_batch: samples that a process holds in memory together, None for all of its batch; batch norms see one part at a time.
         save_every: steps between two saves of the training state.
+        validate_every: steps between two measurements on a recording of validation, whose best weights are the result; 0 for none.
+        validate_frames: maximum number of frames of a measurement, the same ones each time, spread evenly.
     """
 
     steps: int
@@ -61,6 +63,8 @@ class TrainConfig:
     ema_decay: float = 0.999
     micro_batch: int | None = None
     save_every: int = 200
+    validate_every: int = 0
+    validate_frames: int = 40
 
 
 class Task(ABC, Generic[Config, Model, Sample]):
@@ -99,6 +103,14 @@ class Task(ABC, Generic[Config, Model, Sample]):
     def loss(self, model: Model, samples: list[Sample], numbers: range, step: int) -> tuple[Tensor, dict[str, Tensor]]:
         """Compute the loss of samples with these numbers, and the terms for the log, as scalars."""
 
+    def validate(self, weights: Path) -> dict[str, float]:
+        """Measure a file of averaged weights; the first measure, where more is better, decides which are the best.
+
+        Raises:
+            ConfigError: the task has nothing to validate on.
+        """
+        raise ConfigError("This training has no recording of validation; give one, or set validate_every to 0.")
+
     def finish(self, model: Model) -> dict[str, Any]:
         """Adjust the averaged model after the last step; returns additions to its card."""
         return {}
@@ -106,7 +118,10 @@ class Task(ABC, Generic[Config, Model, Sample]):
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of one step: one line of the log. terms: of the loss, and measures of the batch."""
+    """Progress of one step: one line of the log.
+
+    terms: of the loss, and measures of the batch. validation: measures of the averaged weights, empty at most steps.
+    """
 
     step: int
     steps: int
@@ -114,11 +129,14 @@ class Progress:
     terms: dict[str, float]
     learning_rate: float
     seconds: float
+    validation: dict[str, float] = field(default_factory=dict)
 
-    def to_record(self) -> dict[str, float]:
+    def to_record(self) -> dict[str, Any]:
         """Return the line of log.jsonl."""
         terms = {name: round(value, 5) for name, value in self.terms.items()}
-        return {"step": self.step, "loss": round(self.loss, 5), **terms, "lr": self.learning_rate}
+        measures = {name: round(value, 5) for name, value in self.validation.items()}
+        record = {"step": self.step, "loss": round(self.loss, 5), **terms, "lr": self.learning_rate}
+        return record | ({"validation": measures} if measures else {})
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +179,7 @@ class Trainer(Generic[Model, Sample]):
         self.optimiser = make_optimiser(self.model, task.config.weight_decay, task.config.beta2)
         self.step, self.seconds = 0, 0.0
         self.loss: float | None = None  # of the last step
+        self.best: dict[str, float] | None = None  # step and measures of the best validation
         self._name = {"config": checkpoint.config_to_json(task.config), "seed": task.seed, "begun": begun}
         if self.path.exists():
             self._resume()
@@ -171,6 +190,11 @@ class Trainer(Generic[Model, Sample]):
     def log_path(self) -> Path:
         """The file of the log, one line per step."""
         return self.folder / "log.jsonl"
+
+    @property
+    def best_path(self) -> Path:
+        """The file of the averaged weights with the best validation."""
+        return self.folder / "best.safetensors"
 
     @property
     def path(self) -> Path:
@@ -190,10 +214,13 @@ class Trainer(Generic[Model, Sample]):
         with prefetch(self.task.draw, numbers, self.workers) as self._draw, _defer_interrupts() as interrupted:
             while self.step < self.task.steps:
                 unread.append(self._advance())
-                is_due = not self.step % self.task.config.save_every or self.step == self.task.steps
+                is_measured = self._is_measured()
+                is_due = is_measured or not self.step % self.task.config.save_every or self.step == self.task.steps
                 if is_due or interrupted.is_set() or len(unread) >= self._steps_between_reads:
                     for progress in self._read(unread):
                         if not self.rank:
+                            if is_measured and progress.step == self.step:
+                                progress = replace(progress, validation=self._validate())
                             self._log(progress)
                             report(progress)
                     unread = []
@@ -204,10 +231,37 @@ class Trainer(Generic[Model, Sample]):
         self._draw = self.task.draw
         weights = self.folder / "weights.safetensors"
         if not self.rank:
-            about = {"seed": self.task.seed, "steps": self.task.steps, **self.task.finish(self.average)}
-            about |= {"train_seconds": round(self.seconds), "config": asdict(self.task.config)}
-            checkpoint.save(self.average, weights, about | (card or {}), half=True, format=self.task.format)
+            self._write_result(weights, card or {})
         return weights
+
+    def _write_result(self, weights: Path, card: dict[str, Any]) -> None:
+        """Write the averaged weights, those of the best validation where there were any, with their card."""
+        result: Model = self.average
+        about: dict[str, Any] = {"seed": self.task.seed, "steps": self.task.steps}
+        if self.best is not None:
+            result = copy.deepcopy(self.average)
+            result.load_state_dict(checkpoint.read_state(self.best_path, self.task.format), strict=False)
+            about["best_validation"] = self.best
+        about |= self.task.finish(result)
+        about |= {"train_seconds": round(self.seconds), "config": asdict(self.task.config)}
+        checkpoint.save(result, weights, about | card, half=True, format=self.task.format)
+
+    def _is_measured(self) -> bool:
+        """Return whether averaged weights are validated after the current step, the last one always."""
+        every = self.task.config.validate_every
+        return bool(every) and (not self.step % every or self.step == self.task.steps)
+
+    def _validate(self) -> dict[str, float]:
+        """Measure the averaged weights, and keep them where they are the best so far; of equal ones the first."""
+        candidate = self.folder / "candidate.safetensors"
+        checkpoint.save(self.average, candidate, {"step": self.step}, half=True, format=self.task.format)
+        measures = self.task.validate(candidate)
+        first = next(iter(measures))
+        if self.best is None or measures[first] > self.best[first]:
+            self.best = {"step": self.step, **measures}
+            candidate.replace(self.best_path)
+        candidate.unlink(missing_ok=True)
+        return measures
 
     def advance(self) -> Progress:
         """Run one optimiser step."""
@@ -260,7 +314,10 @@ class Trainer(Generic[Model, Sample]):
         parts = {name: to_cpu(getattr(self, name).state_dict()) for name in ("model", "average", "optimiser")}
         # In memory first: torch reports a full disk as a RuntimeError without the file's name.
         content = io.BytesIO()
-        torch.save({**self._name, **parts, "step": self.step, "seconds": self.seconds, "loss": self.loss}, content)
+        torch.save(
+            {**self._name, **parts, "step": self.step, "seconds": self.seconds, "loss": self.loss, "best": self.best},
+            content,
+        )
         if self.log_path.exists():
             flush_files([self.log_path])  # a resumed run keeps the lines up to this state
         atomic_write(self.path, content.getbuffer())
@@ -315,6 +372,7 @@ class Trainer(Generic[Model, Sample]):
         self.average.load_state_dict(state["average"])
         load_optimiser(self.optimiser, state["optimiser"])
         self.step, self.seconds, self.loss = state["step"], state["seconds"], state.get("loss")
+        self.best = state.get("best")
 
     def _is_mine(self, state: dict[str, Any]) -> bool:
         """Return whether a saved state is of this run; fields that are newer than the state have their defaults."""

@@ -11,7 +11,7 @@ import numpy as np
 from manyeyes._io import atomic_replace
 from manyeyes.datatypes import MissingExtraError, RecordingError
 
-_NOT_TERMS = ("step", "lr")
+_NOT_TERMS = ("step", "lr", "validation")
 _SMOOTH_SHARE = 0.02
 
 

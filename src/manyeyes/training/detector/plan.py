@@ -91,7 +91,7 @@ class PlanRun:
         seed: of the first stage.
         folder: of the run.
         start: weights file that the first stage begins from.
-        validation: recording that scores are calibrated on; None leaves them as they are.
+        validation: recording on which stages are validated and scores calibrated; None leaves scores as they are.
         execution: how stages are computed; the codebook and calibration are computed on the CPU.
     """
 
@@ -136,7 +136,7 @@ class PlanRun:
         if (folder / WEIGHTS).exists():
             _check_stage(folder / WEIGHTS, config, seed, begun)
             return folder / WEIGHTS
-        task, execution = DetectorTask(config, self.recording, seed, start), self.execution
+        task, execution = DetectorTask(config, self.recording, seed, start, self.validation), self.execution
         trainer = Trainer(task, folder, execution.device, execution.workers)
         weights = trainer.run({**card, "started_from": begun}, lambda progress: report(name, progress))
         _wait_for_first()

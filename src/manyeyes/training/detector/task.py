@@ -13,7 +13,7 @@ from torch import Tensor
 
 from manyeyes.datasets.base import Recording
 from manyeyes.datasets.recording_check import check_recording
-from manyeyes.datatypes import CheckpointError
+from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector, DetectorConfig
 from manyeyes.models.sensor_domain import write_sensor_domain
@@ -23,6 +23,7 @@ from manyeyes.training.detector.losses import LossConfig
 from manyeyes.training.detector.samples import AugmentConfig, DegradationConfig, Sample, SampleStream, epoch_length
 from manyeyes.training.detector.step import loss_terms
 from manyeyes.training.detector.targets import TargetConfig
+from manyeyes.training.detector.validation import measure_ap, select_frames
 from manyeyes.training.trainer import Task, TrainConfig
 
 NUM_SENSOR_SCENARIOS = 60
@@ -63,15 +64,25 @@ def prune_threshold(config: DetectorTrainConfig, step: int, steps: int) -> float
 class DetectorTask(Task[DetectorTrainConfig, Detector, Sample]):
     """Train a detector on samples of a recording.
 
-    start: weights file that initialises the model; its configuration may differ where tensor shapes agree.
+    start: weights file that initialises the model; its configuration may differ where tensor shapes agree. validation: recording
+    on which averaged weights are measured during training.
     """
 
     format = checkpoint.FORMAT
 
     def __init__(
-        self, config: DetectorTrainConfig, recording: Recording, seed: int = 0, start: Path | None = None
+        self,
+        config: DetectorTrainConfig,
+        recording: Recording,
+        seed: int = 0,
+        start: Path | None = None,
+        validation: Recording | None = None,
     ) -> None:
-        self.config, self.seed, self._start = config, seed, start
+        if config.validate_every and validation is None:
+            raise ConfigError(
+                "validate_every needs a recording of validation; give one (--validation), or set it to 0."
+            )
+        self.config, self.seed, self._start, self._validation = config, seed, start, validation
         self._steps = config.steps or math.ceil(config.epochs * epoch_length(recording) / config.batch)
         self.stream = SampleStream(
             recording, config.detector.grid, config.augment, seed, config.degradation, config.detector.classes
@@ -106,6 +117,12 @@ class DetectorTask(Task[DetectorTrainConfig, Detector, Sample]):
         threshold = prune_threshold(config, step, self.steps)
         terms = loss_terms(model, samples, config.targets, threshold, config.loss.fusion_weight, config.loss.target)
         return terms.total(config.loss), vars(terms)
+
+    def validate(self, weights: Path) -> dict[str, float]:
+        """Return AP@0.5 of intermediate fusion, where there are several agents, and of no fusion."""
+        if self._validation is None:
+            return super().validate(weights)
+        return measure_ap(weights, select_frames(self._validation, self.config.validate_frames))
 
     def finish(self, model: Detector) -> dict[str, Any]:
         """Measure the range of the tokens on samples after those of training, and the sensors of the recording."""

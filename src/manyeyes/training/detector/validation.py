@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""AP of weights on a small, fixed part of a recording during training: no fusion and intermediate fusion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from manyeyes.agents.replay import ReplayConfig
+from manyeyes.datasets.base import Recording
+from manyeyes.datasets.holdout import RecordingPart
+from manyeyes.evaluation.detection.benchmark import benchmark
+from manyeyes.evaluation.detection.recording_filters import FrameStride
+
+WARMUP_FRAMES = 2
+"""Frames before the first evaluated one that fill the histories."""
+MAX_STRIDE = 5
+
+
+def select_frames(recording: Recording, max_frames: int) -> Recording:
+    """Return at most about max_frames evaluated frames, spread over scenarios; of one scenario the first, up to MAX_STRIDE apart.
+
+    Frames between those that are evaluated are replayed too, so that the cost is bounded by MAX_STRIDE.
+    """
+    names = recording.scenarios
+    count = min(len(names), max_frames)
+    chosen = [names[((2 * k + 1) * len(names)) // (2 * count)] for k in range(count)]
+    per_scenario = -(-max_frames // count)
+    shortest = min(len(recording.eval_indices(name)) for name in chosen)
+    stride = max(1, min(MAX_STRIDE, shortest // per_scenario))
+    lengths = {name: _end(recording.eval_indices(name), per_scenario * stride) for name in chosen}
+    return FrameStride(RecordingPart(recording, lengths, dict.fromkeys(chosen, 0)), stride)
+
+
+def _end(indices: range, count: int) -> int:
+    """Return the number of snapshots up to the last of the first indices."""
+    kept = indices[:count]
+    return kept[-1] + 1 if kept else 0
+
+
+def measure_ap(weights: Path, recording: Recording) -> dict[str, float]:
+    """Return AP@0.5 of a file of weights on the CPU: intermediate fusion where there are several agents, then no fusion."""
+    has_several = any(len(recording.agents(name)) > 1 for name in recording.scenarios)
+    methods = ("intermediate", "none") if has_several else ("none",)
+    threads = torch.get_num_threads()
+    try:
+        replay = ReplayConfig(warmup_frames=WARMUP_FRAMES).adapt_to(recording)
+        result = benchmark(recording, str(weights), methods, replay=replay)
+    finally:
+        torch.set_num_threads(threads)  # evaluation sets its own
+    return {f"ap50_{name}": float(result[name].intervals[0].value) for name in methods}
