@@ -28,7 +28,7 @@ def make_cloud(seed: int) -> PointCloud:
 
 def make_twins(config, device) -> tuple[Detector, Detector]:
     """The same detector on the CPU, folded as it is deployed, and on the device."""
-    torch.manual_seed(0)
+    torch.manual_seed(5)  # of which each of the configurations keeps hundreds of cells
     model = Detector(replace(config, prune_threshold=0.05)).eval().requires_grad_(False)
     model.fingerprint = checkpoint.fingerprint(model)
     ours, theirs = fold_norms(model), fold_norms(model).to(device)
@@ -60,9 +60,10 @@ def test_clouds_and_tokens_enter_and_boxes_and_tokens_leave_on_the_cpu(device, c
             values = own.features, own.sites.key, raw.to_rows(), score, fused.bev.features, fused.merged_proposals
             results.append((*values, refined.to_rows()))
     assert len(results[0][0]) > 100
+    largest = float(results[0][0].abs().max())  # of untrained features, of which rounding is a fraction
     for mine, its in zip(*results, strict=True):
         assert its.device.type == "cpu" and type(its) is torch.Tensor
-        assert mine.shape == its.shape and torch.allclose(mine, its, atol=2e-4, rtol=1e-3)
+        assert mine.shape == its.shape and torch.allclose(mine, its, atol=max(2e-4, 1e-6 * largest), rtol=1e-3)
     for mine, its in (boxes, detected):
         # Random weights score many boxes alike, so that rounding may change their order, and who suppresses whom.
         assert type(its.center) is torch.Tensor and its.label.device.type == "cpu" and len(mine) == len(its) > 10

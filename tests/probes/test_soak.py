@@ -92,7 +92,8 @@ def recorded_detector() -> Detector:
     def extract_tokens(points: PointCloud, previous: PointCloud | None = None) -> tuple[SparseBev, RawBoxes]:
         tokens, raw = found.get(id(points)) or found.setdefault(id(points), extract(points, None))
         sites = Sites(tokens.sites.key.clone(), tokens.grid)
-        columns = {f.name: getattr(raw, f.name).clone() for f in fields(raw) if f.name != "sites"}
+        values = ((f.name, getattr(raw, f.name)) for f in fields(raw) if f.name != "sites")
+        columns = {name: value.clone() for name, value in values if isinstance(value, torch.Tensor)}
         return SparseBev(tokens.features.clone(), sites), replace(raw, sites=sites, **columns)
 
     vars(detector)["extract_tokens"] = extract_tokens
