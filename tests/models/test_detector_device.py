@@ -63,7 +63,7 @@ def test_clouds_and_tokens_enter_and_boxes_and_tokens_leave_on_the_cpu(device, c
     largest = float(results[0][0].abs().max())  # of untrained features, of which rounding is a fraction
     for mine, its in zip(*results, strict=True):
         assert its.device.type == "cpu" and type(its) is torch.Tensor
-        assert mine.shape == its.shape and torch.allclose(mine, its, atol=max(2e-4, 1e-6 * largest), rtol=1e-3)
+        assert mine.shape == its.shape and torch.allclose(mine, its, atol=max(2e-4, 4e-6 * largest), rtol=1e-3)
     for mine, its in (boxes, detected):
         # Random weights score many boxes alike, so that rounding may change their order, and who suppresses whom.
         assert type(its.center) is torch.Tensor and its.label.device.type == "cpu" and len(mine) == len(its) > 10
