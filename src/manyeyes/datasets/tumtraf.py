@@ -60,7 +60,7 @@ def _time_of(path: Path) -> int | None:
 
 @dataclass(frozen=True)
 class _Label:
-    """What a label file says of its frame; world_from_roadside: of its LiDAR, as roadside_from_vehicle. names: of the clouds."""
+    """What a label file states of its frame; world_from_roadside: of its LiDAR, as roadside_from_vehicle. names: of the clouds."""
 
     path: Path
     world_from_roadside: Transform

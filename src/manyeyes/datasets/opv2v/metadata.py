@@ -21,7 +21,7 @@ from manyeyes.datatypes.errors import shorten
 
 KMH_PER_MPS = 3.6
 PROTOCOL = "data_protocol.yaml"
-"""Name of the file in a scenario's folder that says how it was simulated."""
+"""Name of the file in a scenario's folder that states how it was simulated."""
 # Columns of a kept array: row 0 is the agent, the rows below are the objects that it lists.
 _COLUMNS, _CACHE_KIND = 16, "opv2v2"
 # Published matrices are rounded; a mirrored or sheared one is farther off than this.

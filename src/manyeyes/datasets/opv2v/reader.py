@@ -53,8 +53,8 @@ from manyeyes.datasets.registry import register_dataset
 from manyeyes.datatypes import AgentBody, AgentFrame, GroundTruth, PointCloud, RecordingError, Snapshot, Transform
 
 _MAX_CACHED_RECORDS = 20_000
-# How many first frames are searched for one that lists objects, and so tells the data set.
-_MAX_TOLD_STEMS = 20
+# Number of first frames that are searched for one that lists objects, which identifies the data set.
+_MAX_DIALECT_STEMS = 20
 # Of CARLA's Lincoln MKZ, which carries the sensors of OPV2V and V2XSet.
 _BODY_SIZE_M = (4.9, 2.1, 1.5)
 _MAX_LIDAR_OFFSET_M = 5.0
@@ -168,7 +168,7 @@ class Opv2vRecording(RecordingReader):
         named = name_dialect(scenario.folder.name, any(agent.binary for agent in scenario.agents))
         if named is not None:
             return named
-        for stem in scenario.stems[:_MAX_TOLD_STEMS]:
+        for stem in scenario.stems[:_MAX_DIALECT_STEMS]:
             records = [r for agent in scenario.agents if stem in agent.stems if (r := self._try_record(agent, stem))]
             if any(len(record.id) or record.has_matrix for record in records):
                 return choose_dialect(agents, records)
@@ -328,7 +328,7 @@ def _stated_height(record: AgentRecord, world_from_lidar: Transform) -> float | 
 
 
 def _carla_body(record: AgentRecord, world_from_agent: Transform) -> AgentBody | None:
-    """Return the vehicle at the record's own pose, in the agent's frame; None where that pose says nothing plausible.
+    """Return the vehicle at the record's own pose, in the agent's frame; None where that pose is not plausible.
 
     OPV2V's LiDAR stands 0.5 m behind the middle of the vehicle. The size is that of all vehicles with sensors there.
     """

@@ -88,16 +88,16 @@ def encode_tokens(
 ) -> F32x2:  # pragma: no cover
     """Return features (N, C) plus their encoding; the first columns of pose_context describe the frame, the last is the age."""
     n, channels = features.shape
-    told = proposal.shape[1]
-    inputs = empty_rows(n, num_frame_columns + 2 + told + pose_context.shape[1] - num_frame_columns)
+    num_proposal_columns = proposal.shape[1]
+    inputs = empty_rows(n, num_frame_columns + 2 + num_proposal_columns + pose_context.shape[1] - num_frame_columns)
     out, when, timed = empty_rows(n, channels), np.zeros(channels, np.float32), np.float32(0)
     for i in range(n):
         row = inputs[i]
         row[:num_frame_columns] = pose_context[i, :num_frame_columns]
         row[num_frame_columns : num_frame_columns + 2] = cell_offset[i]
-        for k in range(told):
+        for k in range(num_proposal_columns):
             row[num_frame_columns + 2 + k] = proposal[i, k] * weights.scale[k]
-        row[num_frame_columns + 2 + told :] = pose_context[i, num_frame_columns:]
+        row[num_frame_columns + 2 + num_proposal_columns :] = pose_context[i, num_frame_columns:]
         age = pose_context[i, -1]
         # Tokens of one message have one age; that of age 0 has no encoding.
         if age != timed:
@@ -182,19 +182,19 @@ def merge_tokens(
     """Return keys (M,) of the occupied cells of [0, size), their merged features (M, C) and proposals (M, P)."""
     n, channels = features.shape
     found, row = _number_cells(key, size)
-    cells, told, at = found.shape[0], proposal.shape[1], columns.offset
+    cells, num_proposal_columns, at = found.shape[0], proposal.shape[1], columns.offset
     boxes = proposal.copy()
     for i in range(n):
         boxes[i, at] += cell_offset[i, 0]
         boxes[i, at + 1] += cell_offset[i, 1]
     share = _weigh(features, boxes, pose_context, drift, row, cells, weights, columns)
-    merged, merged_boxes = empty_rows(cells, channels), np.zeros((cells, told), np.float32)
+    merged, merged_boxes = empty_rows(cells, channels), np.zeros((cells, num_proposal_columns), np.float32)
     merged[:] = np.float32(0)
     statistics = np.zeros((cells, columns.end + 4), np.float32)
     count, score, apart = columns.end, columns.end + 1, columns.end + 2
     for i in range(n):
         r, w = row[i], share[i]
-        for k in range(told):
+        for k in range(num_proposal_columns):
             merged_boxes[r, k] += w * boxes[i, k]
         for c in range(channels):
             merged[r, c] += w * features[i, c]

@@ -100,9 +100,9 @@ def _move_token(
 ) -> bool:  # pragma: no cover
     """Write one token to row at; return whether it is in range."""
     channels, quarter = out.features.shape[1], out.features.shape[1] // 4
-    told, unit = token[channels:], np.float32(columns.speed_unit)
+    stated, unit = token[channels:], np.float32(columns.speed_unit)
     x, y, age = xy[0], xy[1], np.float32(link[2])
-    vx, vy = told[columns.velocity] * unit, told[columns.velocity + 1] * unit
+    vx, vy = stated[columns.velocity] * unit, stated[columns.velocity + 1] * unit
     if np.sqrt(vx * vx + vy * vy) <= max_speed_mps:
         x, y = x + vx * age, y + vy * age
     px, py = np.float64(x), np.float64(y)
@@ -121,12 +121,12 @@ def _move_token(
         feature[2 * k] = token[2 * k] * c - token[2 * k + 1] * s
         feature[2 * k + 1] = token[2 * k] * s + token[2 * k + 1] * c
     feature[2 * quarter :] = token[2 * quarter : channels]
-    moved[:] = told
+    moved[:] = stated
     moved[columns.z] += height
     for k in (columns.offset, columns.direction, columns.velocity):
-        moved[k], moved[k + 1] = told[k] * c - told[k + 1] * s, told[k] * s + told[k + 1] * c
+        moved[k], moved[k + 1] = stated[k] * c - stated[k + 1] * s, stated[k] * s + stated[k + 1] * c
     k, cc, cs = columns.axis, c * c - s * s, np.float32(2) * c * s
-    moved[k], moved[k + 1] = told[k] * cc - told[k + 1] * cs, told[k] * cs + told[k + 1] * cc
+    moved[k], moved[k + 1] = stated[k] * cc - stated[k + 1] * cs, stated[k] * cs + stated[k + 1] * cc
     return True
 
 
@@ -149,10 +149,10 @@ def assign(
     low_x, low_y = np.float32(grid.x_min), np.float32(grid.y_min)
     high_x, high_y = np.float32(grid.x_max), np.float32(grid.y_max)
     for i in range(xy.shape[0]):
-        told = proposal[i]
-        dx, dy = told[columns.offset], told[columns.offset + 1]
+        stated = proposal[i]
+        dx, dy = stated[columns.offset], stated[columns.offset + 1]
         x, y = xy[i, 0], xy[i, 1]
-        if told[columns.heat] > votes[0] and max(abs(dx), abs(dy)) <= votes[1]:
+        if stated[columns.heat] > votes[0] and max(abs(dx), abs(dy)) <= votes[1]:
             gx, gy = x + dx * cell, y + dy * cell
             if gx >= low_x and gx < high_x and gy >= low_y and gy < high_y:
                 x, y = gx, gy

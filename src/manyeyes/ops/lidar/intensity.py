@@ -79,7 +79,7 @@ def compute_intensity(
         law: the sensor's law.
         reflectivity: (N,) of material and incidence, in [0, 1].
         range_m: (N,) from the sensor.
-        elevation_rad: (N,) of the beam, which the per-beam law tells beams apart by.
+        elevation_rad: (N,) of the beam, by which the per-beam law distinguishes beams.
         key: of random draws; equal keys give equal gains of beams, permutations and noise.
 
     Returns:
