@@ -9,8 +9,8 @@ times the operations of its forward pass. Traffic: 4 bytes for each number that 
 six passes over each output for norms, activations and gradients.
 
 Device time = operations / (peak * UTILISATION) + bytes / (bandwidth * BANDWIDTH_SHARE). Peaks of float32 are recalled and
-not checked against data sheets. Host time: what one process needs to issue the operators of a step. Hours = steps * max(host, device).
-Nothing here is measured on a GPU.
+not checked against data sheets. Host time: what one process needs to issue the operators of a step.
+Hours = steps * max(host, device). Nothing here is measured on a GPU.
 
 python benchmarks/train_flops.py OPV2V_LIKE DAIR_LIKE [--samples 3] [--out benchmarks/results/train_flops.json]
 python benchmarks/train_flops.py --write-pages    # tables of docs/guides/train-*.md from the stored results
