@@ -35,6 +35,21 @@ def test_the_file_holds_configuration_seed_versions_commit_and_result(tmp_path) 
     assert [p.name for p in path.parent.iterdir()] == ["result.json"]
 
 
+@pytest.mark.parametrize(
+    ("program", "expected"),
+    [
+        ("benchmarks/loading.py", "python benchmarks/loading.py data/a"),
+        ("/usr/bin/manyeyes", "manyeyes data/a"),
+        ("/home/a/manyeyes/cli/main.py", "manyeyes data/a"),
+    ],
+)
+def test_the_command_names_a_script_and_no_folder_of_the_machine(
+    tmp_path, monkeypatch, program: str, expected: str
+) -> None:
+    monkeypatch.setattr("sys.argv", [program, "data/a"])
+    assert write_json(tmp_path / "result.json", 1, None, 0)["command"] == expected
+
+
 def test_a_failed_write_leaves_the_old_file(tmp_path) -> None:
     path = tmp_path / "result.json"
     write_json(path, 1, None, 0)

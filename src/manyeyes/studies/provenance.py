@@ -70,7 +70,7 @@ def cpu_name() -> str:
 def collect_provenance(config: object, seed: int | None) -> dict[str, Any]:
     """What a reader needs to get the same numbers again. config: a dataclass or plain values."""
     return {
-        "command": shlex.join(["manyeyes", *sys.argv[1:]]),
+        "command": shlex.join([*_program(sys.argv[0]), *sys.argv[1:]]),
         "config": to_plain(config),
         "seed": seed,
         "versions": installed_versions(),
@@ -78,6 +78,12 @@ def collect_provenance(config: object, seed: int | None) -> dict[str, Any]:
         "machine": {"system": platform.platform(), "cpu": cpu_name(), "cores": os.cpu_count()},
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+
+
+def _program(path: str) -> list[str]:
+    """Return the words that start the program: a script that was named by a relative path, else the command manyeyes."""
+    is_script = path.endswith(".py") and not Path(path).is_absolute()
+    return ["python", path] if is_script else ["manyeyes"]
 
 
 def to_plain(value: object) -> Any:

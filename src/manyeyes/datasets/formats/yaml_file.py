@@ -3,7 +3,8 @@
 
 PyYAML writes a numpy value as a call of a Python object (``!!python/object/apply:numpy...``), which its unsafe loader executes.
 Here these tags describe data: a type from a short list, a shape, and base64 bytes whose number must agree with both. Every size
-is bounded before memory is taken: merged mappings, elements of an array, and the length of the file.
+is bounded before memory is taken: merged mappings, elements of an array, and the length of the file. Plain block yaml, which most
+files are, is read by lines (``block_yaml``); the loader here is its reference.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 import yaml
 
 from manyeyes._io import MAX_TEXT_BYTES, read_file
+from manyeyes.datasets.formats.block_yaml import parse_block_yaml
 from manyeyes.datatypes import RecordingError
 
 REMEDY = "copy or download the file again"
@@ -55,7 +57,9 @@ def load_yaml(path: Path) -> Mapping[Any, Any]:
         RecordingError: it cannot be read, is no yaml, has a tag that stands for no number, or exceeds a bound.
     """
     try:
-        content = yaml.load(read_file(path, MAX_TEXT_BYTES), _Loader)
+        data = read_file(path, MAX_TEXT_BYTES)
+        plain = parse_block_yaml(data)
+        content = yaml.load(data, _Loader) if plain is None else plain
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror}), expected a yaml file; {REMEDY}.") from None
     except _UnknownTag as error:
