@@ -67,7 +67,7 @@ def make_variant(name="a", min_pairs=99) -> FeakmVariant:
 
 def test_without_an_estimate_the_ablation_fuses_at_the_prior():
     one, snapshots = make_variant(), [Street().snapshot("street", i) for i in (0, 1)]
-    noise = PoseNoise("all_agents_iid", 1.0, 0.02)
+    noise = PoseNoise("all_agents", 1.0, 0.02)
     perturbed = [noise.apply(s, 0) for s in snapshots]
     perturbed[0] = replace(perturbed[0], frames=snapshots[0].frames)
     boxes, is_found = _CachedViews(one, snapshots).fuse_with_poses(perturbed[1].frames)

@@ -48,7 +48,6 @@ def _evaluate(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes._io import atomic_write_text
-    from manyeyes.datasets.perturbation import PoseNoise
     from manyeyes.datasets.registry import open_recording
     from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, load_detector, resolve_protocol, run_benchmark
     from manyeyes.studies import provenance
@@ -59,14 +58,15 @@ def _evaluate(options: Options) -> None:
     from manyeyes.viz.table import DIFFERENCE_HEADINGS, format_difference_cells, format_markdown, format_markdown_lines
 
     console = Console()
-    has_pose_noise = options.noise_xy_m > 0 or options.noise_yaw_deg > 0
-    noise = PoseNoise("collaborators_iid", options.noise_xy_m, math.radians(options.noise_yaw_deg), options.seed)
+    errors, sigma_yaw_rad = options.pose_errors, math.radians(options.noise_yaw_deg)
+    noise = errors.make_pose_noise(options.seed).at_level(options.noise_xy_m, sigma_yaw_rad)
     config = BenchmarkConfig(
         weights=options.replay_options.weights,
         methods=options.replay_options.methods,
         protocol=options.protocol,
         replay=options.replay_options.make_replay_config(options.seed, options.all_egos),
-        pose_noise=noise if has_pose_noise else None,
+        pose_noise=noise,
+        odometry_drift=None if noise is None else errors.make_odometry_drift(options.seed),
         frame_stride=options.frame_stride,
     )
     protocol, detector = resolve_protocol(config), load_detector(config.weights)
@@ -82,7 +82,10 @@ def _evaluate(options: Options) -> None:
     comparison = summarize_comparison(timed_results, protocol, missing)
     data_name = f"{options.data.name}{f'/{options.split}' if options.split else ''}"
     title = f"{display_name(options.replay_options.weights)} on {data_name}: {len(recording.scenarios)} scenarios, {protocol.name}"
+    note = "" if noise is None else errors.describe(options.seed)
     print_comparison(console, comparison, title)
+    if note:
+        console.print(note, highlight=False, soft_wrap=True)
     provenance.write_json(
         options.out / "results.json", comparison, {"options": options, "benchmark": config}, options.seed
     )
@@ -91,6 +94,8 @@ def _evaluate(options: Options) -> None:
         text += "\n" + format_markdown_lines(
             [DIFFERENCE_HEADINGS, *map(format_difference_cells, comparison.differences)]
         )
+    if note:
+        text += f"\n{note}\n"
     if comparison.footer:
         text += f"\n{comparison.footer}\n"
     atomic_write_text(options.out / "results.md", text)

@@ -114,7 +114,8 @@ def _evaluate_poses(options: Options) -> None:
         raise ConfigError("--correctors takes at least one name; got none.")
     for name in options.correctors:
         find_corrector(name)
-    noise = PoseNoise("collaborators_iid", options.noise_xy_m, math.radians(options.noise_yaw_deg), options.seed)
+    sigma_yaw_rad = math.radians(options.noise_yaw_deg)
+    noise = PoseNoise("collaborators", options.noise_xy_m, sigma_yaw_rad, options.seed, "independent", "true")
     recording = open_recording(options.recording, options.split)
     drive = make_excerpt(recording, options.scenario, options.frames)
     check_evaluated_frames(drive, drive.scenarios)

@@ -4,6 +4,7 @@
 Ground truth and point clouds stay as they are: clouds are in the frame of their agent, whose prior pose alone is wrong.
 Transport delay and loss are not here; they follow from the bytes sent, in ``comms/channel``.
 
+What an agent knows of its own motion is odometry, which drifts by itself (``datasets.odometry_drift``).
 To disturb in both ways, apply the noise to every snapshot first, then the staleness: a stale message carries the noisy
 pose of the instant at which it was captured.
 """
@@ -20,65 +21,103 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import AgentFrame, ConfigError, Snapshot, Transform
+from manyeyes.ops.keyed_autoregressive import keyed_autoregressive
 from manyeyes.ops.keyed_random import keyed_normal
 
-NoiseMode = Literal["collaborators_iid", "all_agents_iid", "all_agents_sequence", "legacy_constant"]
+NoiseMode = Literal["collaborators", "all_agents", "legacy_constant"]
+NoiseInTime = Literal["autoregressive", "constant", "independent"]
+CovarianceClaim = Literal["none", "half", "true", "double"]
+CLAIM_FACTORS: dict[CovarianceClaim, float] = {"none": 0.0, "half": 0.5, "true": 1.0, "double": 2.0}
+"""Claimed standard deviation over the true one."""
+CORRELATION_TIME_S = 10.0
+"""Correlation time of autoregressive noise: errors of satellite positioning in a street last for seconds to minutes."""
 
 
 @dataclass(frozen=True)
 class PoseNoise:
     """Errors of prior poses: sigma_xy_m (metres, each axis of the world) and sigma_yaw_rad (radians), Gaussian.
 
-    mode: ``collaborators_iid`` (the default of this project) moves every agent but the ego, again in each frame;
-    ``all_agents_iid`` (CoAlign) moves the ego too, so that relative errors are sqrt(2) larger;
-    ``all_agents_sequence`` (SparseAlign) moves all, by one error an agent for the whole scenario;
-    ``legacy_constant`` (OpenCOOD) moves every agent but the ego by one and the same offset in x, y, z and yaw in all
-    frames, because that code seeds the generator again in each call. A network can learn that offset, so its curves
-    measure no robustness; it is here for parity.
+    mode: ``collaborators`` moves every agent but the ego; ``all_agents`` (CoAlign, SparseAlign) moves the ego too, so that
+    relative errors are sqrt(2) larger; ``legacy_constant`` (OpenCOOD) moves every agent but the ego by one and the same offset in
+    x, y, z and yaw in all frames, because that code seeds the generator again in each call. A network can learn that offset, so
+    its curves measure no robustness; it is here for parity.
 
-    The first three draw three standard normals keyed by (seed, scenario, frame, agent), the frame being 0 for a
-    sequence, and scale them: the same unit draw at every level, so that curves over levels are paired, and
-    ``collaborators_iid`` and ``all_agents_iid`` agree on the collaborators.
+    in_time: how the error of an agent goes on, with the same variance at every instant: ``autoregressive`` is of first order,
+    autocorrelation exp(-|lag| / correlation_time_s) (``ops.keyed_autoregressive``); ``constant`` is one error for a scenario
+    (SparseAlign); ``independent`` is drawn again in each frame (CoAlign), which whoever remembers averages out.
+
+    claim: standard deviation that agents add to their pose covariance, as a factor of the true one (CLAIM_FACTORS): the
+    covariance weighs the fusion, and real agents seldom know it.
+
+    The three standard normals of an agent follow from (seed, scenario, agent) and its time (``autoregressive``) or its frame
+    (``independent``), whoever else is there, and are scaled: the same unit draw at every level, so that curves over levels are
+    paired, and both modes agree on the collaborators.
     """
 
-    mode: NoiseMode = "collaborators_iid"
+    mode: NoiseMode = "collaborators"
     sigma_xy_m: float = 0.0
     sigma_yaw_rad: float = 0.0
     seed: int = 0
+    in_time: NoiseInTime = "autoregressive"
+    claim: CovarianceClaim = "none"
+    correlation_time_s: float = CORRELATION_TIME_S
 
     def __post_init__(self) -> None:
-        if self.mode not in get_args(NoiseMode):
-            raise ConfigError(f"No pose noise is called {self.mode!r}; known: {', '.join(get_args(NoiseMode))}.")
+        for value, known in ((self.mode, NoiseMode), (self.in_time, NoiseInTime), (self.claim, CovarianceClaim)):
+            if value not in get_args(known):
+                raise ConfigError(f"PoseNoise knows no {value!r}; choose from {', '.join(get_args(known))}.")
         if not (0 <= self.sigma_xy_m < math.inf and 0 <= self.sigma_yaw_rad < math.inf):
             raise ConfigError(
                 f"PoseNoise needs finite sigmas >= 0; got {self.sigma_xy_m} m and {self.sigma_yaw_rad} rad."
             )
+        if not 0 < self.correlation_time_s < math.inf:
+            raise ConfigError(f"PoseNoise.correlation_time_s is finite and above 0; got {self.correlation_time_s}.")
+
+    @property
+    def description(self) -> str:
+        """The kind of error without its level, for notes under tables."""
+        kinds = {
+            "autoregressive": f"autoregressive in time (correlation time {self.correlation_time_s:g} s)",
+            "constant": "constant through a scenario",
+            "independent": "independent in each frame",
+        }
+        kind = "OpenCOOD's constant offset" if self.mode == "legacy_constant" else kinds[self.in_time]
+        return f"{kind}; claimed covariance: {self.claim}"
+
+    def at_level(self, sigma_xy_m: float, sigma_yaw_rad: float) -> PoseNoise | None:
+        """Return the same kind of error at another level; None if nothing is displaced."""
+        scaled = replace(self, sigma_xy_m=sigma_xy_m, sigma_yaw_rad=sigma_yaw_rad)
+        return scaled if sigma_xy_m or sigma_yaw_rad else None
 
     def apply(self, snapshot: Snapshot, ego: int) -> Snapshot:
-        """Return the snapshot with prior poses displaced, their covariance grown by the noise; truth as it was."""
-        everyone = self.mode.startswith("all_agents")
+        """Return the snapshot with prior poses displaced and their covariance grown by the claim; truth as it was."""
         frames = tuple(
-            self._displace(frame, self.offset(snapshot.scenario, snapshot.index, frame.agent_id))
-            if everyone or row != ego
+            self._displace(frame, self.offset(snapshot.scenario, snapshot.index, frame.agent_id, frame.timestamp_ns))
+            if self.mode == "all_agents" or row != ego
             else frame
             for row, frame in enumerate(snapshot.frames)
         )
         return replace(snapshot, frames=frames)
 
-    def offset(self, scenario: str, index: int, agent_id: int) -> Tensor:
+    def offset(self, scenario: str, index: int, agent_id: int, timestamp_ns: int) -> Tensor:
         """Draw the error x, y, z (m) and yaw (rad) of an agent's prior pose in the world, (4,) float64."""
         if self.mode == "legacy_constant":
             x, y, z, yaw = opencood_offset(self.seed, self.sigma_xy_m, self.sigma_yaw_rad)
             # The draw is in CARLA's left-handed world: our y axis and our sense of turning are its opposites.
             return torch.tensor([x, -y, z, -yaw], dtype=torch.float64)
-        frame = 0 if self.mode == "all_agents_sequence" else index
-        x, y, yaw = keyed_normal((3,), self.seed, "pose noise", scenario, frame, agent_id)
+        if self.in_time == "autoregressive":
+            key = (self.seed, "pose noise in time", scenario, agent_id)
+            x, y, yaw = keyed_autoregressive(3, timestamp_ns, self.correlation_time_s, *key)
+        else:
+            frame = 0 if self.in_time == "constant" else index
+            x, y, yaw = keyed_normal((3,), self.seed, "pose noise", scenario, frame, agent_id)
         return torch.stack((self.sigma_xy_m * x, self.sigma_xy_m * y, torch.zeros_like(x), self.sigma_yaw_rad * yaw))
 
     def _displace(self, frame: AgentFrame, offset: Tensor) -> AgentFrame:
         turn = Transform.from_xyz_yaw(0.0, 0.0, 0.0, float(offset[3])).rotation
         pose = frame.world_from_agent
-        variance = torch.tensor([self.sigma_xy_m, self.sigma_xy_m, self.sigma_yaw_rad], dtype=torch.float64).square()
+        sigma = torch.tensor([self.sigma_xy_m, self.sigma_xy_m, self.sigma_yaw_rad], dtype=torch.float64)
+        variance = (CLAIM_FACTORS[self.claim] * sigma).square()
         return replace(
             frame,
             world_from_agent=Transform(turn.to(pose.rotation.dtype) @ pose.rotation, pose.translation + offset[:3]),

@@ -138,7 +138,7 @@ def _iterate_snapshots(
 ) -> Iterator[tuple[tuple[AgentFrame, ...], Floats]]:
     """Yield frames with their prior poses, and the true poses: (N, 3) world, as far as the recording knows."""
     sigma = config.pose_sigma_m
-    noise = PoseNoise("all_agents_iid", sigma, float(np.radians(sigma)), config.seed)
+    noise = PoseNoise("all_agents", sigma, float(np.radians(sigma)), config.seed, "independent", "true")
     for index in range(0, recording.length(scenario), config.frame_stride):
         snapshot = recording.snapshot(scenario, index)
         reported = Transform.stack([frame.world_from_agent for frame in snapshot.frames])

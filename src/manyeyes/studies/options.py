@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from manyeyes._bounds import AngleDeg, ByteCount, OutputFolder, PositiveInt, Seed, TrialCount, WorkerCount
+from manyeyes.studies.pose_error_options import PoseErrorOptions
 from manyeyes.studies.replay_options import FileChecks, ReplayOptions
 
 
@@ -47,6 +48,8 @@ class EvaluationOptions(RecordingStudyOptions):
     """How many processes share the scenarios; results do not depend on it."""
     replay_options: ReplayOptions = field(default_factory=ReplayOptions)
     """How agents collaborate."""
+    pose_errors: PoseErrorOptions = field(default_factory=PoseErrorOptions)
+    """Of what kind pose errors are."""
 
 
 @dataclass(frozen=True, kw_only=True)

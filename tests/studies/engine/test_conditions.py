@@ -12,6 +12,7 @@ import torch
 from manyeyes.agents.pose_correction import PoseCorrection
 from manyeyes.agents.replay import ReplayConfig
 from manyeyes.comms.channel import channel_preset
+from manyeyes.datasets.odometry_drift import OdometryDrift
 from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.datatypes import AgentFrame, PointCloud, Snapshot, Transform
 from manyeyes.evaluation.detection.average_precision import PROTOCOLS, FrameMatch
@@ -49,6 +50,9 @@ def test_a_result_file_is_named_by_all_that_its_numbers_depend_on(weights, tmp_p
         replace(base, num_agents=2),
         replace(base, pose_noise=PoseNoise(sigma_xy_m=0.2)),
         replace(base, pose_noise=PoseNoise(sigma_xy_m=0.2, seed=1)),
+        replace(base, pose_noise=PoseNoise(sigma_xy_m=0.2, claim="true")),
+        replace(base, pose_noise=PoseNoise(sigma_xy_m=0.2, in_time="constant")),
+        replace(base, odometry_drift=OdometryDrift()),
         *(replace(base, replay=ReplayConfig(**changed)) for changed in (
             {"channel": late}, {"channel": late.with_loss(0.1)}, {"token_encoding": "int8"}, {"budget_bytes": 99},
             {"channel_budget_bytes": 999},
@@ -57,7 +61,7 @@ def test_a_result_file_is_named_by_all_that_its_numbers_depend_on(weights, tmp_p
     ]  # fmt: skip
     paths = [path(config, "late", "data") for config in (base, *others)]
     paths += [path(base, "none", "data"), path(base, "late", "other data")]
-    assert len(set(paths)) == len(paths) == 18
+    assert len(set(paths)) == len(paths) == 21
     # Neither the company of other methods nor where the same weights lie makes a difference.
     (tmp_path / "copy.safetensors").write_bytes((weights / "0.safetensors").read_bytes())
     moved = replace(base, weights=str(tmp_path / "copy.safetensors"), methods=("late", "early"))

@@ -17,6 +17,7 @@ import torch
 
 from manyeyes.agents.replay import WARMUP_FRAMES, CachedOutputs, ReplayConfig, ReplayStep, replay
 from manyeyes.datasets.base import Recording
+from manyeyes.datasets.odometry_drift import DriftingOdometry, OdometryDrift
 from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.datatypes import Snapshot
 from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS, MethodResult, MetricAccumulator
@@ -36,7 +37,7 @@ class BenchmarkConfig:
     """What is compared, and how it is evaluated. weights: a name, a path or a detector. protocol: by name, over its range.
 
     frame_stride: judge each so many-th frame. num_agents: the nearest so many, in scenarios that have them; None: all of all
-    scenarios. sensors: changes of all agents' sensors.
+    scenarios. sensors: changes of all agents' sensors. odometry_drift: of all agents, the ego too; None: odometry is true.
     """
 
     weights: str | BoxDetector = pretrained.DEFAULT_DETECTOR
@@ -44,6 +45,7 @@ class BenchmarkConfig:
     protocol: str = "global-sort"
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     pose_noise: PoseNoise | None = None
+    odometry_drift: OdometryDrift | None = None
     frame_stride: int = 1
     num_agents: int | None = None
     sensors: SensorChange = NO_SENSOR_CHANGE
@@ -52,6 +54,11 @@ class BenchmarkConfig:
         """What is evaluated of a recording."""
         filtered = recording if self.num_agents is None else NearestAgents(recording, self.num_agents)
         return filtered if self.frame_stride == 1 else FrameStride(filtered, self.frame_stride)
+
+    def make_perturbation(self) -> Callable[[Snapshot], Snapshot]:
+        """Return what changes the snapshots of one scenario, in their order, before agents read them."""
+        odometry = DriftingOdometry(self.odometry_drift) if self.odometry_drift else None
+        return partial(_perturb, self.sensors, odometry, self.pose_noise)
 
 
 def resolve_protocol(config: BenchmarkConfig) -> DetectionProtocol:
@@ -83,7 +90,7 @@ def run_scenario(
 ) -> list[list[MetricAccumulator]]:
     """Return all methods of each configuration on one scenario; a function of its arguments alone.
 
-    The configurations have the same weights, sensors, view and history: each sweep is read and processed once for all of them.
+    The configurations have the same weights, sensors, odometry, view and history: each sweep is read and processed once.
     """
     torch.set_num_threads(1)
     first = configs[0]
@@ -107,14 +114,18 @@ def _iterate_snapshots(
     recording: Recording, scenario: str, detector: BoxDetector, config: BenchmarkConfig, feature_cache: CachedOutputs
 ) -> Iterator[tuple[int, Iterator[ReplayStep]]]:
     """Return the steps of one configuration, evaluated snapshot by evaluated snapshot."""
-    perturb = partial(_perturb, config.pose_noise, config.sensors)
-    steps = replay(recording, scenario, detector, config.methods, config.replay, perturb, feature_cache)
+    steps = replay(
+        recording, scenario, detector, config.methods, config.replay, config.make_perturbation(), feature_cache
+    )
     return groupby(steps, lambda step: step.snapshot.index)
 
 
-def _perturb(noise: PoseNoise | None, sensors: SensorChange, snapshot: Snapshot) -> Snapshot:
+def _perturb(
+    sensors: SensorChange, odometry: DriftingOdometry | None, noise: PoseNoise | None, snapshot: Snapshot
+) -> Snapshot:
     changed = sensors.apply(snapshot)
-    return noise.apply(changed, 0) if noise else changed
+    measured = odometry.apply(changed) if odometry else changed
+    return noise.apply(measured, 0) if noise else measured
 
 
 def run_benchmarks(
@@ -145,7 +156,8 @@ def run_benchmarks(
 def _group_configs(configs: Sequence[BenchmarkConfig]) -> list[tuple[BenchmarkConfig, ...]]:
     """Return neighbours that can be replayed together, at most TOGETHER of them: what is finished is handed out group by group."""
     comparable = groupby(
-        configs, lambda c: (c.weights, c.frame_stride, c.num_agents, c.replay.warmup_frames, c.sensors)
+        configs,
+        lambda c: (c.weights, c.frame_stride, c.num_agents, c.replay.warmup_frames, c.sensors, c.odometry_drift),
     )
     runs = [tuple(run) for _, run in comparable]
     return [run[k : k + CONDITIONS_PER_GROUP] for run in runs for k in range(0, len(run), CONDITIONS_PER_GROUP)]

@@ -138,7 +138,8 @@ class PoseNoisePredictor:
         ego_frame = snapshot.frames[0]
         world_from_tile = make_world_from_tile(ego_frame)
         truth = source.crop_truth(scenario, world_from_tile, map_model.config.tile)
-        noise = PoseNoise("collaborators_iid", self.sigma_m, float(np.radians(self.deg_per_m * self.sigma_m)), seed)
+        sigma_yaw_rad = float(np.radians(self.deg_per_m * self.sigma_m))
+        noise = PoseNoise("collaborators", self.sigma_m, sigma_yaw_rad, seed, "independent", "true")
         previous_frames = source.recording.snapshot(scenario, snapshot.index - 1).frames if snapshot.index else ()
         caches = [_make_cache(self.detector_weights, frame, previous_frames) for frame in snapshot.frames]
         clean, noisy = (

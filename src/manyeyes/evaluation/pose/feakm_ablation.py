@@ -90,7 +90,7 @@ def run_ablation(
             for variant in variants:
                 views = _CachedViews(variant, snapshots)
                 for sigma in sigmas:
-                    noise = PoseNoise("all_agents_iid", sigma, math.radians(sigma), seed)
+                    noise = PoseNoise("all_agents", sigma, math.radians(sigma), seed, "independent", "true")
                     boxes, is_found = views.fuse_with_poses(noise.apply(snapshots[-1], 0).frames)
                     overlap = compute_frame_iou(FrameResult(scenario, index, boxes, truth), protocol)
                     accumulator = accumulators[variant.name, sigma]

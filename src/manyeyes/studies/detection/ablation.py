@@ -83,7 +83,10 @@ def run(options: AblationOptions, context: StudyContext) -> None:
     ]
     study = prepare_study(options, context)
     conditions = [
-        Condition(_condition_name(variant.name, perturbation), perturbation.apply_to(variant.apply_to(study.base)))
+        Condition(
+            _condition_name(variant.name, perturbation),
+            perturbation.apply_to(variant.apply_to(study.base), study.pose_noise),
+        )
         for variant in variants
         for perturbation in PERTURBATIONS
     ]

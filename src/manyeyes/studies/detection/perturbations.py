@@ -19,7 +19,7 @@ MAX_DELAY_FRAMES = 4
 @dataclass(frozen=True)
 class Perturbation:
     """delay_s: delay of every packet, while the ego does not wait. heading_sigma_deg, position_sigma_m: standard deviations of
-    collaborators' prior poses, resampled in each frame. packet_loss: fraction of packets that are lost.
+    collaborators' prior poses; how they go on in time is a setting of the study. packet_loss: fraction of packets that are lost.
     """
 
     delay_s: float = 0.0
@@ -38,22 +38,21 @@ class Perturbation:
         )
         return ", ".join(text for level, text in parts if level) or "clean"
 
-    def apply_to(self, config: BenchmarkConfig) -> BenchmarkConfig:
-        """Apply it to a configuration.
+    def apply_to(self, config: BenchmarkConfig, pose_noise: PoseNoise | None = None) -> BenchmarkConfig:
+        """Apply it to a configuration. pose_noise: the kind of pose error, at any level; None: the default one.
 
         With any of them, the warm-up is longer by the largest delay, so that conditions share the features of their agents.
         """
         radio, replay = config.replay.radio, config.replay
         channel = replace(radio, base_latency_s=radio.base_latency_s + self.delay_s)
-        noise = PoseNoise("collaborators_iid", self.position_sigma_m, math.radians(self.heading_sigma_deg), replay.seed)
+        kind = pose_noise or PoseNoise(seed=replay.seed)
+        noise = kind.at_level(self.position_sigma_m, math.radians(self.heading_sigma_deg))
         perturbed = with_replay(
             config,
             channel=channel.with_loss(self.packet_loss) if self.packet_loss else channel,
             warmup_frames=replay.warmup_frames + MAX_DELAY_FRAMES,
         )
-        return replace(
-            perturbed, pose_noise=noise if self.position_sigma_m or self.heading_sigma_deg else config.pose_noise
-        )
+        return replace(perturbed, pose_noise=noise or config.pose_noise)
 
 
 CLEAN = Perturbation()

@@ -47,7 +47,7 @@ class QualitativeRow:
 def run(options: EvaluationOptions, context: StudyContext) -> None:
     """Run the qualitative study and write its image."""
     study = prepare_study(options, context)
-    config, recording = COMBINED.apply_to(study.base), study.opener()
+    config, recording = COMBINED.apply_to(study.base, study.pose_noise), study.opener()
     scenario = max(recording.scenarios, key=lambda name: len(recording.agents(name)))
     eval_indices = recording.eval_indices(scenario)
     frame_index = eval_indices[len(eval_indices) // 2]
@@ -61,7 +61,7 @@ def run(options: EvaluationOptions, context: StudyContext) -> None:
             detector,
             config.methods,
             config.replay,
-            lambda snapshot: config.pose_noise.apply(snapshot, 0) if config.pose_noise else snapshot,
+            config.make_perturbation(),
             feature_cache={},
         )
         if step.snapshot.index == frame_index

@@ -93,7 +93,9 @@ def run(options: RobustnessOptions, context: StudyContext) -> None:
     collaborative = tuple(m for m in methods if m != NO_FUSION)
     selected = select_perturbations(options.perturbations, ALL_PERTURBATIONS)
     conditions = [
-        Condition(d.name, d.apply_to(replace(study.base, methods=methods if d == CLEAN else collaborative)))
+        Condition(
+            d.name, d.apply_to(replace(study.base, methods=methods if d == CLEAN else collaborative), study.pose_noise)
+        )
         for d in selected
         if d == CLEAN or collaborative
     ]
@@ -104,7 +106,9 @@ def run(options: RobustnessOptions, context: StudyContext) -> None:
         )
     for baseline, weights in baselines.items():
         base = replace(study.base, methods=(OURS,), weights=weights)
-        conditions += [Condition(_result_key(d, baseline, (baseline,))[0], d.apply_to(base)) for d in selected]
+        conditions += [
+            Condition(_result_key(d, baseline, (baseline,))[0], d.apply_to(base, study.pose_noise)) for d in selected
+        ]
     results = study.run(conditions)
     result_rows, comparisons = make_rows(results, tuple(baselines)), make_comparisons(results, tuple(baselines))
     tables = [

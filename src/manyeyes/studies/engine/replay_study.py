@@ -9,6 +9,7 @@ from functools import partial
 
 from manyeyes.agents.strategies.registry import get_strategy, list_strategies
 from manyeyes.datasets.base import RecordingReader
+from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.datasets.registry import open_recording
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
@@ -31,12 +32,13 @@ PAPER_NOTE = (
 
 @dataclass(frozen=True)
 class ReplayStudy:
-    """A study of a recording. base: the configuration that conditions change."""
+    """A study of a recording. base: the configuration that conditions change; pose_noise: the kind of their pose errors."""
 
     context: StudyContext
     opener: Callable[[], RecordingReader]
     base: BenchmarkConfig
     workers: int = 1
+    pose_noise: PoseNoise = PoseNoise()
 
     @property
     def title(self) -> str:
@@ -60,7 +62,10 @@ class ReplayStudy:
         conditions: Sequence[Condition] = (),
         notes: Sequence[str] = (),
     ) -> None:
-        """Write the report, with curves as its picture."""
+        """Write the report, with curves as its picture; a note states the kind of pose errors."""
+        options = self.context.options
+        if isinstance(options, EvaluationOptions):
+            notes = (*notes, options.pose_errors.describe(options.seed))
         save_picture = partial(save_curves, panels) if panels else None
         self.context.write_report(self.title, payload, tables, save_picture, notes, {"conditions": conditions})
 
@@ -80,7 +85,9 @@ def prepare_study(options: EvaluationOptions, context: StudyContext, all_egos: b
     config = BenchmarkConfig(replay_options.weights, replay_options.methods, options.protocol, replay)
     study = open_study(options, context, config)
     replay = adapt_to_dataset(replay, replay_options, study.opener())
-    return replace(study, base=replace(study.base, replay=replay), workers=options.workers)
+    errors = options.pose_errors
+    base = replace(study.base, replay=replay, odometry_drift=errors.make_odometry_drift(options.seed))
+    return replace(study, base=base, workers=options.workers, pose_noise=errors.make_pose_noise(options.seed))
 
 
 def resolve_token_selection(names: Sequence[str]) -> tuple[str, ...]:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from manyeyes.agents.pose_correction import PoseCorrection
 from manyeyes.datasets.base import Recording
+from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS
 from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
 from manyeyes.evaluation.pose.accuracy import count_common_objects
@@ -87,7 +88,7 @@ def run(options: PoseNoiseApOptions, context: StudyContext) -> None:
     collaborative = tuple(m for m in study.base.methods if m != NO_FUSION)
     base = replace(study.base, methods=collaborative)
     conditions = [
-        Condition(condition_name(name, level), apply_level(base, level, name))
+        Condition(condition_name(name, level), apply_level(base, level, name, study.pose_noise))
         for name in names
         for level in levels
         if collaborative
@@ -95,7 +96,9 @@ def run(options: PoseNoiseApOptions, context: StudyContext) -> None:
     baselines = parse_checkpoints(options.checkpoints, "pose-noise-ap") if options.checkpoints else {}
     for baseline, weights in baselines.items():
         base = replace(study.base, methods=(OURS,), weights=weights)
-        conditions += [Condition(condition_name(baseline, level), level.apply_to(base)) for level in levels]
+        conditions += [
+            Condition(condition_name(baseline, level), level.apply_to(base, study.pose_noise)) for level in levels
+        ]
     if NO_FUSION in study.base.methods:
         conditions.append(Condition(NO_FUSION, CLEAN.apply_to(replace(study.base, methods=(NO_FUSION,)))))
     results = study.run(conditions)
@@ -118,10 +121,10 @@ def run(options: PoseNoiseApOptions, context: StudyContext) -> None:
     study.write_report(payload, tables, make_panels(result_rows), conditions, (PAPER_NOTE,))
 
 
-def apply_level(config: BenchmarkConfig, level: Perturbation, corrector: str) -> BenchmarkConfig:
-    """Apply a level of noise, with a corrector before every fusion."""
+def apply_level(config: BenchmarkConfig, level: Perturbation, corrector: str, pose_noise: PoseNoise) -> BenchmarkConfig:
+    """Apply a level of noise of that kind, with a corrector before every fusion."""
     correction = None if corrector == IDENTITY else PoseCorrection(corrector)
-    return with_replay(level.apply_to(config), pose_correction=correction)
+    return with_replay(level.apply_to(config, pose_noise), pose_correction=correction)
 
 
 def condition_name(name: str, level: Perturbation) -> str:
