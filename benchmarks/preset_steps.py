@@ -2,13 +2,12 @@
 """AP of presets of the published data sets after 200 steps on simulated scenes, beside the network of costr-small.
 
 costr-opv2v is trained on scenes of 64 beams in OPV2V's layout, costr-dair on scenes with DAIR-V2X's sensors and layout, each from
-random weights. The small network has the same range, samples, learning rate and steps, so that only the networks differ. AP is
-that of the split val, over the range of the detector. Two hundred steps show that a preset learns; they do not rank networks.
+random weights. The small network has the same range, samples, learning rate and steps, so that only the networks differ. Scenes
+are those of the presets smoke-opv2v and dair-crossing on the generated towns of SPLITS. AP is that of the split val, over the
+range of the detector. Two hundred steps show that a preset learns; they do not rank networks.
 Stopped runs go on: each run keeps its state in its folder, every 10 steps, and finished evaluations are kept.
 
-manyeyes simulate --preset smoke-opv2v      # few scenes of 64 beams; or any recording like it with splits train and val
-manyeyes simulate --preset dair-crossing
-python benchmarks/preset_steps.py data/smoke-opv2v data/dair-crossing [--steps 200] [--runs runs/preset_steps] [--frames 40]
+python benchmarks/preset_steps.py [--steps 200] [--data data/preset_steps] [--runs runs/preset_steps] [--frames 40]
 """
 
 from __future__ import annotations
@@ -26,12 +25,20 @@ from manyeyes.datasets.base import iter_eval_frames
 from manyeyes.datasets.registry import open_recording
 from manyeyes.evaluation.detection.recording_filters import FrameStride
 from manyeyes.models.detector.presets import COSTR_SMALL
+from manyeyes.simulator.presets import SplitPreset, make_jobs, simulation_preset
+from manyeyes.simulator.record import record
 from manyeyes.studies.provenance import write_json
 from manyeyes.training.detector.presets import DETECTOR_TRAINING_PRESETS
 from manyeyes.training.detector.task import DetectorTask, DetectorTrainConfig
 from manyeyes.training.trainer import Trainer
 
-PRESETS = ("costr-opv2v", "costr-dair")
+SCENES = {"costr-opv2v": "smoke-opv2v", "costr-dair": "dair-crossing"}
+"""Presets of training, and the preset of simulation whose sensors and layout stand for their data set."""
+SPLITS = (
+    SplitPreset("train", ("generated-1", "generated-4", "generated-6", "generated-7"), 16),
+    SplitPreset("val", ("generated-2", "generated-8"), 4),
+)
+FRAMES = 5
 NETWORKS = ("preset", "small")
 METHODS = ("none", "intermediate")
 LEARNING_RATE = 1e-3
@@ -85,19 +92,28 @@ def find_row(root: Path, preset: str, network: str, steps: int, runs: Path, max_
     return row
 
 
+def simulate_scenes(preset: str, root: Path) -> Path:
+    """Simulate the scenes of a preset of training, unless they are there; returns their folder."""
+    name = SCENES[preset]
+    folder = root / name
+    jobs = make_jobs(replace(simulation_preset(name), splits=SPLITS, frames=FRAMES), 0)
+    record(jobs, folder, 1, None, {"preset": f"{name}, splits of benchmarks/preset_steps.py", "seed": 0})
+    return folder
+
+
 def main() -> None:
     """Train and evaluate both networks of both presets, print and store."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("recordings", type=Path, nargs=2, help="scenes like OPV2V's, and scenes like DAIR-V2X's")
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--frames", type=int, default=40, help="frames that are evaluated at most")
+    parser.add_argument("--data", type=Path, default=Path("data/preset_steps"))
     parser.add_argument("--runs", type=Path, default=Path("runs/preset_steps"))
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/preset_steps.json"))
     given = parser.parse_args()
     torch.set_num_threads(1)
     rows = [
         find_row(root, preset, network, given.steps, given.runs, given.frames)
-        for preset, root in zip(PRESETS, given.recordings)
+        for preset, root in [(preset, simulate_scenes(preset, given.data)) for preset in SCENES]
         for network in NETWORKS
     ]
     for row in rows:

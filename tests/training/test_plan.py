@@ -103,12 +103,14 @@ def test_finished_stages_need_only_their_weights(finished, toy, tmp_path):
 @pytest.mark.parametrize(
     ("changed", "seed", "reason"),
     [
-        (PLAN.change_stages(learning_rate=0.5), 5, "other settings"),
-        (PLAN, 6, "another seed"),
+        (PLAN.change_stages(learning_rate=0.5), 5, "learning_rate is .* there and 0.5 here"),
+        (PLAN, 6, "the seed is 5 there and 6 here"),
     ],
 )
 def test_a_stage_of_another_run_is_refused(finished, toy, changed, seed, reason):
-    with pytest.raises(CheckpointError, match=rf"one/weights.safetensors: belongs to a stage with {reason}; give"):
+    with pytest.raises(
+        CheckpointError, match=rf"one/weights.safetensors: belongs to a stage of another run: {reason}. Give"
+    ):
         PlanRun(changed, road(toy), seed, finished).run()
 
 
@@ -123,7 +125,7 @@ def test_a_plan_begins_from_given_weights_and_refuses_those_of_another_run(toy, 
     given, trained = checkpoint.read_state(tmp_path / "a.safetensors"), checkpoint.read_state(weights)
     assert torch.allclose(trained["head.out.weight"].float(), given["head.out.weight"], atol=1e-3)
     assert checkpoint.load(weights).codebook is None
-    with pytest.raises(CheckpointError, match="other initial weights"):
+    with pytest.raises(CheckpointError, match=r"initial weights are \w+ there and \w+ here"):
         PlanRun(plan, road(toy), 0, tmp_path / "run", tmp_path / "b.safetensors").run()
 
 

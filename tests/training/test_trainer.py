@@ -135,8 +135,12 @@ def test_the_same_seed_is_the_same_run_and_another_is_not(tmp_path):
 
 def test_a_folder_of_another_run_or_a_damaged_state_is_refused(tmp_path):
     Trainer(LineTask(CONFIG, 3), tmp_path).save()
-    for task in (LineTask(CONFIG, 4), LineTask(replace(CONFIG, learning_rate=1.0), 3), LineTask(CONFIG, 3, True)):
-        with pytest.raises(CheckpointError, match=r"last\.pt: belongs to a run of another configuration or seed"):
+    for task, difference in (
+        (LineTask(CONFIG, 4), "the seed is 3 there and 4 here"),
+        (LineTask(replace(CONFIG, learning_rate=1.0), 3), "learning_rate is 0.1 there and 1.0 here"),
+        (LineTask(CONFIG, 3, True), r"initial weights are random there and \w{16} here"),
+    ):
+        with pytest.raises(CheckpointError, match=rf"last\.pt: belongs to another run: {difference}\. Give"):
             Trainer(task, tmp_path)
     path = tmp_path / "last.pt"
     path.write_bytes(path.read_bytes()[:1000])
@@ -224,5 +228,5 @@ def test_a_state_that_is_older_than_a_field_of_the_configuration_goes_on(tmp_pat
     del stored["micro_batch"]
     torch.save({**state, "config": json.dumps(stored)}, run.path)
     assert Trainer(LineTask(CONFIG), tmp_path).step == 1
-    with pytest.raises(CheckpointError, match="belongs to a run of another configuration"):
+    with pytest.raises(CheckpointError, match="micro_batch is None there and 2 here"):
         Trainer(LineTask(replace(CONFIG, micro_batch=2)), tmp_path)

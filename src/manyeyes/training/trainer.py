@@ -26,6 +26,7 @@ from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.models import checkpoint
 from manyeyes.training.optimiser import AveragedWeights, clip_gradients, load_optimiser, make_optimiser, to_cpu
 from manyeyes.training.prefetch import prefetch
+from manyeyes.training.run_identity import RunIdentity
 
 STEPS_BETWEEN_READS = 10
 """Off the CPU, losses are read, checked and logged every so many steps, and before a save: reading waits for the device."""
@@ -180,7 +181,7 @@ class Trainer(Generic[Model, Sample]):
         self.step, self.seconds = 0, 0.0
         self.loss: float | None = None  # of the last step
         self.best: dict[str, float] | None = None  # step and measures of the best validation
-        self._name = {"config": checkpoint.config_to_json(task.config), "seed": task.seed, "begun": begun}
+        self._identity = RunIdentity(task.config, task.seed, begun)
         if self.path.exists():
             self._resume()
         if not self.rank:
@@ -315,7 +316,14 @@ class Trainer(Generic[Model, Sample]):
         # In memory first: torch reports a full disk as a RuntimeError without the file's name.
         content = io.BytesIO()
         torch.save(
-            {**self._name, **parts, "step": self.step, "seconds": self.seconds, "loss": self.loss, "best": self.best},
+            {
+                **self._identity.to_record(),
+                **parts,
+                "step": self.step,
+                "seconds": self.seconds,
+                "loss": self.loss,
+                "best": self.best,
+            },
             content,
         )
         if self.log_path.exists():
@@ -363,25 +371,16 @@ class Trainer(Generic[Model, Sample]):
             raise CheckpointError(
                 f"{self.path}: not a whole training state ({type(error).__name__}); delete it to start again."
             ) from error
-        if not self._is_mine(state):
+        differences = self._identity.list_differences(state)
+        if differences:
             raise CheckpointError(
-                f"{self.path}: belongs to a run of another configuration or seed, or that began from other weights; give another "
-                "--out, or delete it."
+                f"{self.path}: belongs to another run: {'; '.join(differences)}. Give another --out, or delete it."
             )
         self.model.load_state_dict(state["model"])
         self.average.load_state_dict(state["average"])
         load_optimiser(self.optimiser, state["optimiser"])
         self.step, self.seconds, self.loss = state["step"], state["seconds"], state.get("loss")
         self.best = state.get("best")
-
-    def _is_mine(self, state: dict[str, Any]) -> bool:
-        """Return whether a saved state is of this run; fields that are newer than the state have their defaults."""
-        try:
-            config = checkpoint.config_from_json(type(self.task.config), str(state.get("config")))
-        except (ConfigError, ValueError):
-            return False
-        same = checkpoint.config_to_json(config) == self._name["config"]
-        return same and all(state.get(name, "") == self._name[name] for name in ("seed", "begun"))
 
 
 def warmup_cosine(warmup_steps: int, step: int, steps: int) -> float:

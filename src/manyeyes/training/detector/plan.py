@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import KW_ONLY, asdict, dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -24,6 +24,7 @@ from manyeyes.training.detector.codebook import attach_codebook, fit_codebook
 from manyeyes.training.detector.score_calibration import calibrate_detector
 from manyeyes.training.detector.task import DetectorTask, DetectorTrainConfig
 from manyeyes.training.devices import Execution
+from manyeyes.training.run_identity import RunIdentity
 from manyeyes.training.trainer import Progress, Trainer
 
 WEIGHTS = "weights.safetensors"
@@ -228,22 +229,11 @@ def _select_stage_facts(card: dict[str, Any]) -> dict[str, Any]:
 def _check_stage(path: Path, config: DetectorTrainConfig, seed: int, begun: str) -> None:
     """Refuse weights of a stage that do not belong to this run; fields that are newer than the weights have their defaults."""
     card = checkpoint.read_card(path)
-    try:
-        stored = checkpoint.config_from_json(DetectorTrainConfig, json.dumps(card.get("config")))
-    except ConfigError:
-        stored = None
-    differing = [
-        what
-        for what, same in (
-            ("other settings", stored == checkpoint.config_from_json(DetectorTrainConfig, json.dumps(asdict(config)))),
-            ("another seed", card.get("seed") == seed),
-            ("other initial weights", card.get("started_from") == begun),
-        )
-        if not same
-    ]
-    if differing:
+    stored = {"config": json.dumps(card.get("config")), "seed": card.get("seed"), "begun": card.get("started_from")}
+    differences = RunIdentity(config, seed, begun).list_differences(stored)
+    if differences:
         raise CheckpointError(
-            f"{path}: belongs to a stage with {' and '.join(differing)}; give another --out, or delete its folder."
+            f"{path}: belongs to a stage of another run: {'; '.join(differences)}. Give another --out, or delete its folder."
         )
 
 
