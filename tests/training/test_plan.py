@@ -18,8 +18,8 @@ from manyeyes.models.detector.presets import COSTR_TINY
 from manyeyes.training.detector.plan import PlanRun, TrainPlan
 from manyeyes.training.detector.samples import AugmentConfig
 from manyeyes.training.detector.task import DetectorTrainConfig
+from manyeyes.training.monitor import Progress
 from manyeyes.training.presets import TRAINING_PLANS, TRAINING_PRESETS
-from manyeyes.training.trainer import Progress
 
 pytestmark = pytest.mark.training
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options of commands that train: where and how steps are computed."""
+"""Options of commands that train: where and how steps are computed, and what is written for TensorBoard."""
 
 from __future__ import annotations
 
@@ -19,3 +19,5 @@ class ComputeOptions:
     micro_batch: BatchSize | None = None
     """Samples that a process holds in memory together; gradients accumulate over the parts of its batch. Batch norms see one part
     at a time, so that the result differs from that of the whole batch."""
+    tensorboard: bool = False
+    """Writes scalars of every step, and pictures at every validation, to the folder tensorboard of a stage (extra train)."""

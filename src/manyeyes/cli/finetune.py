@@ -69,7 +69,8 @@ def main(options: Options) -> None:
 
     torch.set_num_threads(options.threads)
     with hold_folder(options.out):
-        execution = Execution(resolve_device(options.compute.device), options.compute.workers)
+        compute = options.compute
+        execution = Execution(resolve_device(compute.device), compute.workers, compute.tensorboard)
         _finetune(options, execution, Console())
 
 
@@ -81,7 +82,7 @@ def _finetune(options: Options, execution: Execution, console: Console) -> None:
     from manyeyes.studies import provenance
     from manyeyes.training.detector.finetune import choose_steps, make_finetune_plan
     from manyeyes.training.detector.plan import PlanRun
-    from manyeyes.training.trainer import Progress
+    from manyeyes.training.monitor import Progress
     from manyeyes.viz.progress import make_progress_bars
 
     training, holdout = _open_parts(options, console)

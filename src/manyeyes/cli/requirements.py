@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib.util
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from operator import attrgetter
 from typing import Any
 
 from manyeyes.datatypes.errors import MissingExtraError
@@ -19,6 +20,7 @@ EXTRAS = {
     "ray": ("ray",),
     "icp": ("small_gicp",),
     "ros": ("rosbags",),
+    "train": ("tensorboard", "matplotlib", "PIL"),
 }
 """Modules that each extra installs."""
 
@@ -27,7 +29,8 @@ EXTRAS = {
 class Requirement:
     """Modules that a command imports, and the extra that installs them.
 
-    option: the field of the command's Options that decides whether it imports them; without one it always does.
+    option: the field of the command's Options that decides whether it imports them, with dots in a nested one; without one it
+    always does.
     patterns: the values of that option for which it does, as of fnmatch; an option that is None matches none.
     """
 
@@ -44,7 +47,7 @@ class Requirement:
         """Return whether a command with these options imports the modules."""
         if not self.option:
             return True
-        value = getattr(options, self.option)
+        value = attrgetter(self.option)(options)
         values = value if isinstance(value, tuple) else (value,)
         return any(fnmatchcase(str(v), pattern) for v in values if v is not None for pattern in self.patterns)
 
@@ -52,7 +55,7 @@ class Requirement:
     def condition(self) -> str:
         """The option and its values, for messages; empty where the modules are always imported."""
         values = ", ".join(pattern for pattern in self.patterns if pattern not in ("*", "True"))
-        return f"{self.option} {values}".strip()
+        return f"{self.option.rpartition('.')[2]} {values}".strip()
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -70,14 +73,15 @@ _EXECUTORS = (
     Requirement("dask", EXTRAS["dask"]).when("executor", "dask"),
     Requirement("ray", EXTRAS["ray"]).when("executor", "ray"),
 )
+_TENSORBOARD = Requirement("train", EXTRAS["train"]).when("compute.tensorboard", "True")
 _GICP = Requirement("icp", EXTRAS["icp"]).when("correctors", "gicp")
 
 REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
     "demo": (Requirement("sim", EXTRAS["sim"]), Requirement("view", EXTRAS["view"])),
     "check": (),
     "simulate": (_SUMO, _PILLOW.when("cameras", "True"), _PILLOW.when("preset", "*-camera")),
-    "train": (_MATPLOTLIB, _SHAPELY.when("preset", "map-*")),
-    "finetune": (),
+    "train": (_MATPLOTLIB, _SHAPELY.when("preset", "map-*"), _TENSORBOARD),
+    "finetune": (_TENSORBOARD,),
     "fit-codebook": (),
     "calibrate": (),
     "evaluate": (),

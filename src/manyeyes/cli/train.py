@@ -118,7 +118,8 @@ def main(options: Options) -> None:
     with open_device(options.compute.device) as device:
         is_first = not dist.is_initialized() or dist.get_rank() == 0
         with hold_folder(out) if is_first else nullcontext():
-            _train(options, chosen, out, Execution(device, options.compute.workers), Console(quiet=not is_first))
+            execution = Execution(device, options.compute.workers, options.compute.tensorboard)
+            _train(options, chosen, out, execution, Console(quiet=not is_first))
 
 
 def choose_preset(options: Options) -> TrainConfig | TrainPlan:
@@ -243,11 +244,12 @@ def _train_stage(
     missing: MissingFiles,
     bars: ProgressBars,
 ) -> _FinishedRun:
-    from manyeyes.training.trainer import Progress, Trainer
+    from manyeyes.training.monitor import Progress
+    from manyeyes.training.trainer import Trainer
 
     task = _make_task(options, config, recording, missing, bars)
     card = _make_card(options, task.config)
-    trainer = Trainer(task, out, execution.device, execution.workers)
+    trainer = Trainer(task, out, execution.device, execution.workers, execution.tensorboard)
     row = bars.add_task("Training", total=task.steps)
 
     def report(at: Progress) -> None:
@@ -271,7 +273,7 @@ def _train_plan(
 
     from manyeyes.models import checkpoint, pretrained
     from manyeyes.training.detector.plan import PlanRun
-    from manyeyes.training.trainer import Progress
+    from manyeyes.training.monitor import Progress
 
     rows: dict[str, Any] = {}
     last: Progress | None = None

@@ -10,12 +10,8 @@ from manyeyes._lazy import attach
 if TYPE_CHECKING:
     from manyeyes.training.detector.task import DetectorTask as DetectorTask, DetectorTrainConfig as DetectorTrainConfig
     from manyeyes.training.maps.task import MapTask as MapTask, MapTrainConfig as MapTrainConfig
+    from manyeyes.training.monitor import Progress as Progress
     from manyeyes.training.pose.feakm import FeakmTask as FeakmTask, FeakmTrainConfig as FeakmTrainConfig
-    from manyeyes.training.trainer import (
-        Progress as Progress,
-        Task as Task,
-        TrainConfig as TrainConfig,
-        Trainer as Trainer,
-    )
+    from manyeyes.training.trainer import Task as Task, TrainConfig as TrainConfig, Trainer as Trainer
 
 __getattr__, __dir__ = attach(__name__)

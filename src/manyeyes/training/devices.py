@@ -19,10 +19,14 @@ _FORMS = "auto, cpu, cuda or cuda:N"
 
 @dataclass(frozen=True)
 class Execution:
-    """How a run computes; its samples and their order do not depend on it. workers: processes that draw samples ahead."""
+    """How a run computes and what it writes beside its log; its samples and their order do not depend on it.
+
+    workers: processes that draw samples ahead. tensorboard: whether scalars and pictures for TensorBoard are written.
+    """
 
     device: torch.device = torch.device("cpu")
     workers: int = 0
+    tensorboard: bool = False
 
 
 def resolve_device(name: str = "auto", local_rank: int | None = None) -> torch.device:

@@ -12,10 +12,10 @@ import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import torch
 import torch.distributed as dist
@@ -24,9 +24,13 @@ from torch import Tensor, nn
 from manyeyes._io import atomic_write, atomic_write_text, flush_files, name_errors
 from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.models import checkpoint
+from manyeyes.training.monitor import Monitor, Progress
 from manyeyes.training.optimiser import AveragedWeights, clip_gradients, load_optimiser, make_optimiser, to_cpu
 from manyeyes.training.prefetch import prefetch
 from manyeyes.training.run_identity import RunIdentity
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 STEPS_BETWEEN_READS = 10
 """Off the CPU, losses are read, checked and logged every so many steps, and before a save: reading waits for the device."""
@@ -112,32 +116,13 @@ class Task(ABC, Generic[Config, Model, Sample]):
         """
         raise ConfigError("This training has no recording of validation; give one, or set validate_every to 0.")
 
+    def draw_pictures(self, weights: Path) -> dict[str, Image]:
+        """Draw what a file of averaged weights finds, by name; nothing by default."""
+        return {}
+
     def finish(self, model: Model) -> dict[str, Any]:
         """Adjust the averaged model after the last step; returns additions to its card."""
         return {}
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Progress of one step: one line of the log.
-
-    terms: of the loss, and measures of the batch. validation: measures of the averaged weights, empty at most steps.
-    """
-
-    step: int
-    steps: int
-    loss: float
-    terms: dict[str, float]
-    learning_rate: float
-    seconds: float
-    validation: dict[str, float] = field(default_factory=dict)
-
-    def to_record(self) -> dict[str, Any]:
-        """Return the line of log.jsonl."""
-        terms = {name: round(value, 5) for name, value in self.terms.items()}
-        measures = {name: round(value, 5) for name, value in self.validation.items()}
-        record = {"step": self.step, "loss": round(self.loss, 5), **terms, "lr": self.learning_rate}
-        return record | ({"validation": measures} if measures else {})
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,15 +144,22 @@ class Trainer(Generic[Model, Sample]):
 
     device: of the model; samples are drawn on the CPU. The state of a run can be resumed on any device.
     workers: processes that draw the samples of run ahead of its steps; 0 draws them in this one. The result is the same.
+    tensorboard: whether run writes scalars and pictures to the folder tensorboard.
 
     Raises:
         CheckpointError: the folder holds a run of another configuration, seed or initial weights, or a damaged state.
     """
 
     def __init__(
-        self, task: Task[Any, Model, Sample], folder: Path, device: torch.device | str = "cpu", workers: int = 0
+        self,
+        task: Task[Any, Model, Sample],
+        folder: Path,
+        device: torch.device | str = "cpu",
+        workers: int = 0,
+        tensorboard: bool = False,
     ) -> None:
         self.task, self.folder, self.device, self.workers = task, folder, torch.device(device), workers
+        self._tensorboard, self._monitor = tensorboard, Monitor()
         self._draw = task.draw
         self.rank, self.world_size = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
         with torch.random.fork_rng():
@@ -210,30 +202,49 @@ class Trainer(Generic[Model, Sample]):
         The first process writes the log and calls report at every step. SIGINT and SIGTERM end the run after its current step,
         which is saved.
         """
-        unread: list[_StepResult] = []
         numbers = (n for step in range(self.step, self.task.steps) for n in self._sample_numbers(step))
-        with prefetch(self.task.draw, numbers, self.workers) as self._draw, _defer_interrupts() as interrupted:
-            while self.step < self.task.steps:
-                unread.append(self._advance())
-                is_measured = self._is_measured()
-                is_due = is_measured or not self.step % self.task.config.save_every or self.step == self.task.steps
-                if is_due or interrupted.is_set() or len(unread) >= self._steps_between_reads:
-                    for progress in self._read(unread):
-                        if not self.rank:
-                            if is_measured and progress.step == self.step:
-                                progress = replace(progress, validation=self._validate())
-                            self._log(progress)
-                            report(progress)
-                    unread = []
-                if is_due or interrupted.is_set():
-                    self.save()
-                if interrupted.is_set():
-                    raise KeyboardInterrupt
+        with (
+            prefetch(self.task.draw, numbers, self.workers) as self._draw,
+            self._open_monitor() as self._monitor,
+            _defer_interrupts() as interrupted,
+        ):
+            self._run_steps(report, interrupted)
         self._draw = self.task.draw
         weights = self.folder / "weights.safetensors"
         if not self.rank:
             self._write_result(weights, card or {})
         return weights
+
+    def _open_monitor(self) -> AbstractContextManager[Monitor]:
+        if self.rank or not self._tensorboard:
+            return nullcontext(Monitor())
+        from manyeyes.training.tensorboard import open_tensorboard
+
+        return open_tensorboard(self.folder, self.step)
+
+    def _run_steps(self, report: Callable[[Progress], None], interrupted: threading.Event) -> None:
+        unread: list[_StepResult] = []
+        while self.step < self.task.steps:
+            unread.append(self._advance())
+            is_measured = self._is_measured()
+            is_due = is_measured or not self.step % self.task.config.save_every or self.step == self.task.steps
+            if is_due or interrupted.is_set() or len(unread) >= self._steps_between_reads:
+                for progress in self._read(unread):
+                    if not self.rank:
+                        self._record(progress, is_measured and progress.step == self.step, report)
+                unread = []
+            if is_due or interrupted.is_set():
+                self.save()
+            if interrupted.is_set():
+                raise KeyboardInterrupt
+
+    def _record(self, progress: Progress, is_measured: bool, report: Callable[[Progress], None]) -> None:
+        """Record a step in the log and with observers; is_measured: after a validation."""
+        if is_measured:
+            progress = replace(progress, validation=self._validate())
+        self._log(progress)
+        self._monitor.record(progress)
+        report(progress)
 
     def _write_result(self, weights: Path, card: dict[str, Any]) -> None:
         """Write the averaged weights, those of the best validation where there were any, with their card."""
@@ -257,6 +268,8 @@ class Trainer(Generic[Model, Sample]):
         candidate = self.folder / "candidate.safetensors"
         checkpoint.save(self.average, candidate, {"step": self.step}, half=True, format=self.task.format)
         measures = self.task.validate(candidate)
+        if self._monitor.draws:
+            self._monitor.show(self.step, self.task.draw_pictures(candidate))
         first = next(iter(measures))
         if self.best is None or measures[first] > self.best[first]:
             self.best = {"step": self.step, **measures}

@@ -24,8 +24,9 @@ from manyeyes.training.detector.codebook import attach_codebook, fit_codebook
 from manyeyes.training.detector.score_calibration import calibrate_detector
 from manyeyes.training.detector.task import DetectorTask, DetectorTrainConfig
 from manyeyes.training.devices import Execution
+from manyeyes.training.monitor import Progress
 from manyeyes.training.run_identity import RunIdentity
-from manyeyes.training.trainer import Progress, Trainer
+from manyeyes.training.trainer import Trainer
 
 WEIGHTS = "weights.safetensors"
 CODEBOOK, CALIBRATION = "codebook", "calibration"
@@ -138,7 +139,7 @@ class PlanRun:
             _check_stage(folder / WEIGHTS, config, seed, begun)
             return folder / WEIGHTS
         task, execution = DetectorTask(config, self.recording, seed, start, self.validation), self.execution
-        trainer = Trainer(task, folder, execution.device, execution.workers)
+        trainer = Trainer(task, folder, execution.device, execution.workers, execution.tensorboard)
         weights = trainer.run({**card, "started_from": begun}, lambda progress: report(name, progress))
         _wait_for_first()
         return weights

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -23,8 +23,11 @@ from manyeyes.training.detector.losses import LossConfig
 from manyeyes.training.detector.samples import AugmentConfig, DegradationConfig, Sample, SampleStream, epoch_length
 from manyeyes.training.detector.step import loss_terms
 from manyeyes.training.detector.targets import TargetConfig
-from manyeyes.training.detector.validation import measure_ap, select_frames
+from manyeyes.training.detector.validation import draw_frame, measure_ap, select_frames
 from manyeyes.training.trainer import Task, TrainConfig
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 NUM_SENSOR_SCENARIOS = 60
 """Maximum number of scenarios whose sensors are measured at the end of training."""
@@ -123,6 +126,12 @@ class DetectorTask(Task[DetectorTrainConfig, Detector, Sample]):
         if self._validation is None:
             return super().validate(weights)
         return measure_ap(weights, select_frames(self._validation, self.config.validate_frames))
+
+    def draw_pictures(self, weights: Path) -> dict[str, Image]:
+        """Draw a frame of validation with true and detected boxes, for each method that is measured."""
+        if self._validation is None:
+            return {}
+        return draw_frame(weights, select_frames(self._validation, self.config.validate_frames))
 
     def finish(self, model: Detector) -> dict[str, Any]:
         """Measure the range of the tokens on samples after those of training, and the sensors of the recording."""

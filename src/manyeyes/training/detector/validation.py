@@ -4,18 +4,27 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 
-from manyeyes.agents.replay import ReplayConfig
+from manyeyes.agents.replay import DetectionReplay, ReplayConfig
 from manyeyes.datasets.base import Recording
 from manyeyes.datasets.holdout import RecordingPart
 from manyeyes.evaluation.detection.benchmark import benchmark
 from manyeyes.evaluation.detection.recording_filters import FrameStride
+from manyeyes.models import pretrained
+from manyeyes.viz.birds_eye import draw_scene, make_scene
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 WARMUP_FRAMES = 2
 """Frames before the first evaluated one that fill the histories."""
 MAX_STRIDE = 5
+MIN_DRAWN_SCORE = 0.2
+"""Of boxes in pictures: those of weights that have hardly been trained score low."""
+PICTURE_WIDTH = 1024
 
 
 def select_frames(recording: Recording, max_frames: int) -> Recording:
@@ -41,8 +50,7 @@ def _end(indices: range, count: int) -> int:
 
 def measure_ap(weights: Path, recording: Recording) -> dict[str, float]:
     """Return AP@0.5 of a file of weights on the CPU: intermediate fusion where there are several agents, then no fusion."""
-    has_several = any(len(recording.agents(name)) > 1 for name in recording.scenarios)
-    methods = ("intermediate", "none") if has_several else ("none",)
+    methods = _select_methods(recording)
     threads = torch.get_num_threads()
     try:
         replay = ReplayConfig(warmup_frames=WARMUP_FRAMES).adapt_to(recording)
@@ -50,3 +58,27 @@ def measure_ap(weights: Path, recording: Recording) -> dict[str, float]:
     finally:
         torch.set_num_threads(threads)  # evaluation sets its own
     return {f"ap50_{name}": float(result[name].intervals[0].value) for name in methods}
+
+
+def _select_methods(recording: Recording) -> tuple[str, ...]:
+    has_several = any(len(recording.agents(name)) > 1 for name in recording.scenarios)
+    return ("intermediate", "none") if has_several else ("none",)
+
+
+def draw_frame(weights: Path, recording: Recording) -> dict[str, Image]:
+    """Draw the first evaluated frame from above, of the scenario in the middle: points, true boxes, and what each method detects.
+
+    Returns:
+        Pictures by method, on the CPU, as of measure_ap.
+    """
+    name = recording.scenarios[len(recording.scenarios) // 2]
+    last = recording.eval_indices(name)[0]
+    snapshots = [recording.snapshot(name, index) for index in range(max(0, last - WARMUP_FRAMES), last + 1)]
+    detector, replay = pretrained.load(str(weights)), ReplayConfig().adapt_to(recording)
+    pictures = {}
+    for method in _select_methods(recording):
+        player = DetectionReplay(method, detector, replay)
+        boxes = [step.boxes for snapshot in snapshots for step in player.step(snapshot)][-1]
+        scene, caption = make_scene(snapshots[-1], boxes), f"frame {last} · {method}"
+        pictures[method] = draw_scene(scene, detector.detection_range, name, caption, PICTURE_WIDTH, MIN_DRAWN_SCORE)
+    return pictures
