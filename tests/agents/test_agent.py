@@ -21,6 +21,7 @@ from manyeyes.comms.wire import TokenEncoding
 from manyeyes.datatypes import AgentFrame, ConfigError, Message, PointCloud, Transform
 from manyeyes.models.detector.box_head import RawBoxes
 from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.fusion.token_merge import FusedBev
 from manyeyes.models.fusion.transform_tokens import AgentTokens, Tokens
 from manyeyes.training.detector.samples import AgentView, AugmentConfig, DegradationConfig, make_sample
@@ -113,7 +114,52 @@ def test_training_forward_equals_share_bytes_perceive(drive, detector: Detector,
     Boxes are not followed: training sees two sweeps of an instant, and the velocities that the detector states. Frames are not
     levelled on either side, since the poses of views are those of the recording.
     """
-    agents, moments, road = ROADS[name]
+    check_forward_against_bytes(drive, detector, *ROADS[name])
+
+
+@pytest.mark.parametrize("fusion", ["max/bare", "attfuse/bare"])
+def test_a_bare_fusion_computes_in_training_what_its_bytes_give(drive, detector: Detector, fusion: str) -> None:
+    check_forward_against_bytes(drive, make_bare(detector, fusion), *ROADS["late"])
+
+
+def test_a_bare_message_costs_its_features_and_is_not_remembered(drive, detector: Detector) -> None:
+    """float16: two bytes a channel instead of those of the proposal too; an earlier message changes nothing."""
+    bare, some = make_bare(detector, "max/bare"), drive(2)
+    packets = [
+        Agent(m, token_encoding="float16", budget_bytes=None).share(some.frame(1, NOW)) for m in (bare, detector)
+    ]
+    messages = [read_whole(Agent(m), p) for m, p in zip((bare, detector), packets)]
+    (tokens, same), (own, whole) = (len(m.tokens.sites) for m in messages), (sum(map(len, p)) for p in packets)
+    channels = detector.encoder.out_channels
+    assert tokens == same > 20 and messages[0].tokens.features.shape == (tokens, channels)
+    assert whole - own >= 2 * PROPOSAL_DIM * tokens and 2 * channels * tokens <= own < 2.4 * channels * tokens
+    early = Agent(bare, token_encoding="float16").share(some.frame(1, NOW - 1))
+    boxes = []
+    for before in ((), early):
+        ego = Agent(bare, token_encoding="float16")
+        ego.perceive(some.frame(0, NOW - 1), before)
+        boxes.append(ego.perceive(some.frame(0, NOW), packets[0]).boxes.center)
+    assert torch.equal(*boxes)
+
+
+def read_whole(agent: Agent, packets: list[bytes]) -> Message:
+    inbox = agent.inbox()
+    for packet in packets:
+        inbox.push(packet)
+    (message,) = inbox.messages()
+    return message
+
+
+def make_bare(detector: Detector, fusion: str) -> Detector:
+    """The same encoder and head with a bare fusion."""
+    torch.manual_seed(1)
+    bare = Detector(replace(detector.config, fusion=fusion))
+    bare.load_state_dict(detector.state_dict(), strict=False)
+    bare.fingerprint = b"testbare"
+    return bare.eval().requires_grad_(False)
+
+
+def check_forward_against_bytes(drive, detector: Detector, agents: int, moments: int, road: DegradationConfig) -> None:
     some, first = drive(agents), NOW + 1 - moments
     seen = [some.snapshot(i) for i in range(first, NOW + 1)]
     sample = make_sample(seen, 0, detector.config.grid, AugmentConfig.none(), ("same", 1), road)

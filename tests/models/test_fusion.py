@@ -295,5 +295,5 @@ def test_a_registered_fusion_module_is_built_by_name():
 
 
 def test_an_unknown_fusion_module_lists_the_known_ones():
-    with pytest.raises(ConfigError, match=r"No fusion module is called 'telepathy'; known: .*max, multi-scale"):
+    with pytest.raises(ConfigError, match=r"No fusion module is called 'telepathy'; known: .*max, .*multi-scale"):
         Detector(dataclasses.replace(COSTR_TINY, fusion="telepathy"))

@@ -58,8 +58,25 @@ def draw_weights(layer: nn.Module) -> None:
 def test_tokens_move_as_by_tensors() -> None:
     got, want = to_ego_frame(parts(), GRID, 2), by_tensors(parts())
     assert 100 < len(got.xy) < 220 and torch.equal(got.ego, want.ego)
-    for name in ("features", "xy", "pose_context", "proposal", "selection_mask"):
+    for name in ("features", "xy", "pose_context", "proposal", "selection_mask", "sender_xy"):
         assert torch.allclose(getattr(got, name), getattr(want, name), atol=2e-5), name
+    assert torch.equal(got.sender, want.sender) and torch.equal(got.infrastructure, want.infrastructure)
+
+
+@pytest.mark.parametrize("transform", [lambda some: to_ego_frame(some, GRID, 2), by_tensors], ids=["loops", "tensors"])
+def test_a_token_names_its_sender_its_type_and_its_place_in_the_senders_frame(transform) -> None:
+    some = parts()
+    some[1] = replace(some[1], is_infrastructure=True)
+    tokens = transform(some)
+    assert sorted({*zip(tokens.ego.tolist(), tokens.sender.tolist())}) == [(0, 0), (0, 1), (1, 1)]
+    assert torch.equal(tokens.infrastructure, (tokens.ego == 0) & (tokens.sender == 1))
+    from_second = tokens.sender_xy[tokens.infrastructure]
+    assert 10 < len(from_second) < 90
+    assert (from_second[:, None] == some[1].xy).all(2).any(1).all()
+    # Messages in another order have other numbers, and no other difference.
+    turned = transform([some[0], some[2], some[1], some[3]])
+    assert torch.equal(turned.sender[turned.infrastructure].unique(), torch.tensor([2]))
+    assert torch.equal(turned.features, tokens.features)
 
 
 def test_tokens_are_assigned_to_cells_as_by_tensors() -> None:

@@ -32,6 +32,9 @@ def tokens(n: int = 50, batch: int = 2, seed: int = 0) -> Tokens:
         torch.zeros(n, POSE_CONTEXT_DIM),
         proposal,
         torch.ones(n),
+        torch.arange(n),
+        torch.zeros(n, dtype=torch.bool),
+        xy,
         GRID,
         batch,
     )

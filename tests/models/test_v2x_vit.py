@@ -31,7 +31,9 @@ def tokens(n: int = 60, batch: int = 2, seed: int = 0, reach_m: float = 12.0) ->
     ego, cue = torch.randint(0, batch, (n,), generator=rng), torch.randn(n, POSE_CONTEXT_DIM, generator=rng)
     cue[torch.rand(n, generator=rng) < 0.5] = 0
     cue[:, 3:] = cue[:, 3:].abs()
-    return Tokens(torch.randn(n, CHANNELS, generator=rng), xy, ego, cue, proposal, torch.ones(n), GRID, batch)
+    features, roadside = torch.randn(n, CHANNELS, generator=rng), torch.zeros(n, dtype=torch.bool)
+    sender = torch.where(cue.any(1), torch.arange(1, n + 1), 0)
+    return Tokens(features, xy, ego, cue, proposal, torch.ones(n), sender, roadside, xy, GRID, batch)
 
 
 def speaking(model: torch.nn.Module) -> torch.nn.Module:
@@ -113,14 +115,13 @@ def test_received_tokens_use_their_own_weights():
 
 def test_egos_are_independent_and_gradients_reach_every_layer():
     some, model = tokens(), speaking(V2xVitFusion(CHANNELS, CONFIG))
-    columns = ("features", "xy", "ego", "pose_context", "proposal", "selection_mask")
-    first = model(replace(some, **{name: getattr(some, name)[some.ego == 0] for name in columns}))
+    first = model(some.select((some.ego == 0).nonzero()[:, 0]))
     together = model(some)
     wanted = together.bev.features[together.bev.sites.batch == 0]
     torch.testing.assert_close(first.bev.features, wanted, atol=1e-4, rtol=1e-4)
     model.requires_grad_(True)(some).bev.features.square().sum().backward()
     assert all(p.grad is not None and bool(p.grad.abs().sum() > 0) for p in model.layers.parameters())
-    none = replace(some, **{name: getattr(some, name)[:0] for name in columns})
+    none = some.select(torch.zeros(0, dtype=torch.int64))
     assert model(none).bev.features.shape == (0, CHANNELS)
 
 

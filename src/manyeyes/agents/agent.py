@@ -29,9 +29,12 @@ from manyeyes.agents.strategies.request_maps import make_request_map
 from manyeyes.agents.token_codec import (
     decode_tokens,
     default_token_encoding,
+    has_token_history,
     make_token_format,
+    pack_tokens,
     quantise_tokens,
     require_codebook,
+    unpack_tokens,
 )
 from manyeyes.comms import wire
 from manyeyes.comms.agent_body import count_agent_body_bytes
@@ -162,9 +165,12 @@ class Agent:
 
     def _select(self, message: Message, tokens: SparseBev, budget_bytes: int | None) -> tuple[Message, SelectedTokens]:
         """Return the message with the tokens that fit into a budget, as the detector made them, and them as they are encoded."""
-        tokens = tokens.with_features(self.token_format.clamp(tokens.features))
+        detector = self.perception_cache.detector
+        packed = pack_tokens(tokens, detector)
+        packed = packed.with_features(self.token_format.clamp(packed.features))
+        tokens = unpack_tokens(packed, detector)
         is_coded, tables = self.token_encoding == "codebook", self.token_format.tables
-        encoded = quantise_tokens(tokens, self.perception_cache.detector) if is_coded else tokens
+        encoded = quantise_tokens(packed, detector) if is_coded else packed
         score = torch.ones(len(tokens.sites)) if message.token_score is None else message.token_score
         mtu = wire.DEFAULT_MTU - count_agent_body_bytes(message.body)
         selected = select_for_packets(encoded, score, budget_bytes, self.token_encoding, mtu, tables)
@@ -274,7 +280,7 @@ class Agent:
             self._accepted_poses = accept_poses(self._accepted_poses, stated, frame.timestamp_ns)
             usable, corrections = self._correct_poses(frame, tuple(received))
             messages = [reception.message for reception in usable]
-            if self.strategy.uses_history:
+            if self.strategy.uses_history and has_token_history(self.perception_cache.detector):
                 untrusted = {correction.agent_id for correction in corrections if correction.untrusted}
                 messages = self.message_history.update_and_get(messages, frame.timestamp_ns, untrusted.union(excluded))
             boxes = self.strategy.fuse(self.perception_cache, frame, messages)

@@ -166,7 +166,9 @@ class PerceptionCache:
         for before, output in self.previous_outputs(frame, num_frames):
             if isinstance(output, TokenOutput):
                 tokens, age_s = output.shared_tokens, (frame.timestamp_ns - before.timestamp_ns) / 1e9
-                parts.append(AgentTokens(0, tokens.features, tokens.sites.xy, frame.now_from_earlier(before), age_s))
+                motion, roadside = frame.now_from_earlier(before), before.is_infrastructure
+                part = AgentTokens(0, tokens.features, tokens.sites.xy, motion, age_s, is_infrastructure=roadside)
+                parts.append(part)
         return parts
 
     def record_sent(self, frame: AgentFrame, tokens: SparseBev) -> None:

@@ -36,7 +36,25 @@ def make_token_format(detector: BoxDetector) -> TokenFormat:
     codebook = detector.codebook
     tables = None if codebook is None else CodeTables(detector.fingerprint, codebook.frequencies.cpu().numpy())
     peaks = getattr(detector, "token_peaks", None)
-    return TokenFormat(detector.fingerprint, detector.token_grid, detector.token_channels, tables, peaks)
+    channels = getattr(detector, "packed_channels", detector.token_channels)
+    return TokenFormat(detector.fingerprint, detector.token_grid, channels, tables, peaks)
+
+
+def pack_tokens(tokens: SparseBev, detector: BoxDetector) -> SparseBev:
+    """Return the columns of shared tokens (N, C + PROPOSAL) that a detector sends: all, but of a bare fusion."""
+    pack = getattr(detector, "pack_tokens", None)
+    return tokens if pack is None else pack(tokens)
+
+
+def unpack_tokens(tokens: SparseBev, detector: BoxDetector) -> SparseBev:
+    """Return packed tokens as (N, C + PROPOSAL); proposals that were not sent are neutral."""
+    unpack = getattr(detector, "unpack_tokens", None)
+    return tokens if unpack is None else unpack(tokens)
+
+
+def has_token_history(detector: BoxDetector) -> bool:
+    """Return whether a detector fuses tokens of earlier frames: any but one with a bare fusion."""
+    return not getattr(detector, "is_bare", False)
 
 
 def quantise_tokens(tokens: SparseBev, detector: BoxDetector) -> SparseBev:
@@ -58,4 +76,4 @@ def decode_tokens(
     reason = "wrong_model" if is_other_model else token_format.check_tokens(tokens)
     if reason is not None:
         return replace(received, message=replace(message, tokens=None)), token_rejection(message.agent_id, reason)
-    return replace(received, message=replace(message, tokens=tokens)), None
+    return replace(received, message=replace(message, tokens=unpack_tokens(tokens, detector))), None

@@ -162,7 +162,7 @@ def load(path: Path) -> Detector:
     model = load_as(path, FORMAT, DetectorConfig, Detector)
     model.fingerprint = fingerprint(model)
     card = read_card(path)
-    model.token_peaks = read_token_peaks(card, model.token_channels, path)
+    model.token_peaks = read_token_peaks(card, model.packed_channels, path)
     model.score_calibration = read_score_calibration(card, path)
     model.sensor_domain = read_sensor_domain(card, path)
     return model

@@ -14,8 +14,9 @@ from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.message_header import age_s, ego_from_sender, make_header
 from manyeyes.agents.strategies.redundancy import novelty_score
 from manyeyes.agents.strategies.registry import FusionStrategy, register_strategy
+from manyeyes.agents.token_codec import has_token_history
 from manyeyes.comms.request_map import compute_request_weights
-from manyeyes.datatypes import AgentFrame, Boxes, Message
+from manyeyes.datatypes import AgentFrame, Boxes, Message, SparseBev
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat
 from manyeyes.models.fusion.transform_tokens import AgentTokens, Tokens, to_ego_frame
 from manyeyes.ops.keyed_random import keyed_uniform
@@ -39,24 +40,42 @@ def random_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
     ).float()
 
 
+WeighScores = Callable[[PerceptionCache, AgentFrame, SparseBev, Tensor, Sequence[Message]], Tensor]
+"""Weighs the scores (N,) of tokens by received messages, the requests of the last instant; tokens of -inf are not sent."""
+
+
+def weigh_by_requests(
+    cache: PerceptionCache, frame: AgentFrame, tokens: SparseBev, score: Tensor, requests: Sequence[Message]
+) -> Tensor:
+    """Lower the scores (N,) of tokens where receivers are confident (``comms.request_map``)."""
+    return score * compute_request_weights(tokens.sites.xy, frame.world_from_agent, requests)
+
+
 @register_strategy("intermediate")
 @dataclass(frozen=True)
 class IntermediateFusion(FusionStrategy):
-    """Fusion of tokens of the ego's own weights; the inbox rejects others. score: order in which a budget keeps tokens."""
+    """Fusion of tokens of the ego's own weights; the inbox rejects others.
+
+    score: order in which a budget keeps tokens. weigh: how requests of receivers change it.
+    """
 
     score: Callable[[PerceptionCache, AgentFrame], Tensor] = novelty_score
     uses_history: bool = True
     needs_tokens: bool = True
     uses_points = False
     score_form = "fused"
+    weigh: WeighScores = weigh_by_requests
 
     def compose_message(
         self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()
     ) -> Message | None:
         """Return the pruned tokens with their proposals, and their scores for selection within a budget."""
         tokens, header = cache.process_tokens(frame).shared_tokens, make_header(frame, cache.detector.fingerprint)
-        weights = compute_request_weights(tokens.sites.xy, frame.world_from_agent, requests)
-        return replace(header, tokens=tokens, token_score=self.score(cache, frame) * weights)
+        score = self.weigh(cache, frame, tokens, self.score(cache, frame), requests)
+        is_sent = score > -torch.inf
+        if not bool(is_sent.all()):
+            tokens, score = tokens.keep(is_sent), score[is_sent]
+        return replace(header, tokens=tokens, token_score=score)
 
     def record_sent(self, cache: PerceptionCache, frame: AgentFrame, message: Message) -> None:
         """Record the sent tokens, which reduce the scores of later ones (``strategies.redundancy``)."""
@@ -80,10 +99,12 @@ def gather_ego_tokens(
 
     Older tokens are propagated by their proposed velocity, and weighted by their age (``models.fusion.token_merge``).
     """
-    own, past = cache.process_tokens(frame).shared_tokens, cache.previous_tokens(frame)
+    own = cache.process_tokens(frame).shared_tokens
+    past = cache.previous_tokens(frame) if has_token_history(cache.detector) else []
     on_grid = [(m, m.tokens) for m in messages if m.tokens is not None and m.tokens.grid == own.grid]
     received = [_to_agent_tokens(frame, message, tokens.features, tokens.sites.xy) for message, tokens in on_grid]
-    tokens = to_ego_frame([AgentTokens(0, own.features, own.sites.xy), *received, *past], own.grid, 1)
+    current = AgentTokens(0, own.features, own.sites.xy, is_infrastructure=frame.is_infrastructure)
+    tokens = to_ego_frame([current, *received, *past], own.grid, 1)
     return tokens, to_ego_frame(past, own.grid, 1) if past else None
 
 
@@ -92,6 +113,5 @@ def _to_agent_tokens(frame: AgentFrame, message: Message, features: Tensor, xy: 
     variance = (frame.pose_covariance + message.pose_covariance).diagonal()
     sigma_xy_m = float((variance[:2].mean()).clamp_min(0).sqrt())
     sigma_yaw_rad = float(variance[2].clamp_min(0).sqrt())
-    return AgentTokens(
-        0, features, xy, ego_from_sender(frame, message), age_s(frame, message), sigma_xy_m, sigma_yaw_rad
-    )
+    motion, age, roadside = ego_from_sender(frame, message), age_s(frame, message), message.is_infrastructure
+    return AgentTokens(0, features, xy, motion, age, sigma_xy_m, sigma_yaw_rad, is_infrastructure=roadside)

@@ -15,7 +15,6 @@ from manyeyes.agents.perception_cache import PerceptionCache, is_consecutive
 from manyeyes.agents.strategies.intermediate import IntermediateFusion, gather_ego_tokens
 from manyeyes.agents.strategies.message_header import make_header
 from manyeyes.agents.strategies.registry import register_strategy
-from manyeyes.comms.request_map import compute_request_weights
 from manyeyes.datatypes import AgentFrame, Boxes, Message
 
 
@@ -32,8 +31,8 @@ class MultiHopFusion(IntermediateFusion):
         if cache.last_fused is None or not is_consecutive(frame, cache.last_fused[0]):
             return super().compose_message(cache, frame, requests)
         then, tokens = cache.last_fused
-        weights = compute_request_weights(tokens.sites.xy, frame.world_from_agent, requests)
-        score = torch.sigmoid(cache.token_detector.score_tokens(tokens)) * weights
+        score = torch.sigmoid(cache.token_detector.score_tokens(tokens))
+        score = self.weigh(cache, frame, tokens, score, requests)
         return replace(make_header(then, cache.detector.fingerprint), tokens=tokens, token_score=score)
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes._bounds import ChannelCount, FiniteFloat
-from manyeyes.datatypes import VEHICLES, BevGrid, Boxes, PointCloud, SparseBev
+from manyeyes.datatypes import VEHICLES, BevGrid, Boxes, ConfigError, PointCloud, SparseBev
 from manyeyes.models.detector.box_head import BoxHead, DecodeConfig, RawBoxes, RefineHead, decode
 from manyeyes.models.detector.codebook import Codebook, CodebookConfig
 from manyeyes.models.detector.encoder import EncoderConfig, SparseEncoder
 from manyeyes.models.detector.pillars import PillarEncoder, PillarKind
-from manyeyes.models.detector.proposal import PROPOSAL_DIM, make_proposals
+from manyeyes.models.detector.proposal import NO_HEAT_LOGIT, PROPOSAL_DIM, make_bare_proposals, make_proposals
 from manyeyes.models.detector.pruning import FocalPrune, PruneOutput
 from manyeyes.models.detector.selector import Selector
 from manyeyes.models.detector.transformer import AttentionConfig, WindowTransformer
@@ -86,13 +86,18 @@ class Detector(nn.Module):
         self.selector = Selector(channels)
         self.fusion = get_fusion(config.fusion)(channels, config.fusion_attention)
         self.head = BoxHead(channels, config.head_channels, config.classes)
-        self.refine = RefineHead(channels, config.head_channels, config.classes)
+        self.is_bare = bool(getattr(self.fusion, "is_bare", False))
+        self.refine = None if self.is_bare else RefineHead(channels, config.head_channels, config.classes)
+        if self.is_bare and config.codebook is not None:
+            raise ConfigError(
+                f"fusion {config.fusion} sends features without proposals: it has no codebook; use float16."
+            )
         self.codebook = None if config.codebook is None else Codebook(channels, config.codebook)
 
     @property
     def device(self) -> torch.device:
         """The device of the weights; results are returned on the device of the inputs, so that agents keep to the CPU."""
-        return self.refine.out.weight.device
+        return self.head.out.weight.device
 
     @property
     def token_grid(self) -> BevGrid:
@@ -101,8 +106,17 @@ class Detector(nn.Module):
 
     @property
     def token_channels(self) -> int:
-        """Number of columns of a shared token."""
+        """Number of columns of a shared token, before it is packed."""
         return self.encoder.out_channels + PROPOSAL_DIM
+
+    @property
+    def packed_channels(self) -> int:
+        """Number of columns of a token that is sent: of a bare fusion features, and the confidence if it needs one."""
+        return self.encoder.out_channels + self._sends_confidence if self.is_bare else self.token_channels
+
+    @property
+    def _sends_confidence(self) -> bool:
+        return bool(getattr(self.fusion, "sends_confidence", False))
 
     @property
     def decode_config(self) -> DecodeConfig:
@@ -148,6 +162,20 @@ class Detector(nn.Module):
         """Concatenate features (N, C) and the proposals of raw to the shared tokens (N, C + PROPOSAL_DIM)."""
         return tokens.with_features(torch.cat((tokens.features, make_proposals(raw)), 1))
 
+    def pack_tokens(self, tokens: SparseBev) -> SparseBev:
+        """Return the columns of shared tokens that are sent (N, packed_channels)."""
+        if not self.is_bare:
+            return tokens
+        return tokens.with_features(tokens.features[:, : self.packed_channels])
+
+    def unpack_tokens(self, tokens: SparseBev) -> SparseBev:
+        """Return received tokens (N, packed_channels) as (N, token_channels); proposals that were not sent are neutral."""
+        if not self.is_bare:
+            return tokens
+        channels, rows = self.encoder.out_channels, tokens.features
+        heat = rows[:, channels] if self._sends_confidence else rows.new_full((len(rows),), NO_HEAT_LOGIT)
+        return tokens.with_features(torch.cat((rows[:, :channels], make_bare_proposals(heat)), 1))
+
     def score_tokens(self, tokens: SparseBev) -> Tensor:
         """Return importance logits (N,) of the tokens; under a budget the highest are sent."""
         return self.selector(tokens.to(self.device)).to(tokens.features.device)
@@ -155,10 +183,12 @@ class Detector(nn.Module):
     def fuse(self, tokens: Tokens, past: Tokens | None = None) -> tuple[FusedBev, RawBoxes]:
         """Fuse the tokens of all agents around each ego, its own included; and raw boxes in the ego's frame.
 
+        Boxes of a bare fusion come from the single-agent head on the fused features.
+
         past: the ego's tokens of earlier instants, transformed to its current frame.
         """
         given = tokens.features.device
         fused = self.fusion(tokens.to(self.device), None if past is None else past.to(self.device))
-        raw = self.refine(fused.bev, fused.merged_proposals)
+        raw = self.head(fused.bev) if self.refine is None else self.refine(fused.bev, fused.merged_proposals)
         fused = fused.to(given)
         return fused, raw.on(fused.bev.sites)

@@ -17,11 +17,18 @@ from manyeyes.models.detector.box_head import BOX_LAYOUT, SPEED_UNIT, RawBoxes
 
 PROPOSAL_DIM = BOX_LAYOUT.total
 """Number of proposal columns: those of RawBoxes, in its order."""
+NO_HEAT_LOGIT = -16.0
+"""Heat of tokens that were sent without proposal and without confidence."""
 
 
 def make_proposals(raw: RawBoxes) -> Tensor:
     """Return proposals (N, PROPOSAL_DIM) from the head's outputs, without gradient."""
     return raw.to_rows().detach().clamp(-16, 16)
+
+
+def make_bare_proposals(heat: Tensor) -> Tensor:
+    """Return proposals (N, PROPOSAL_DIM) of tokens that were sent without: heat logits (N,), no offset, no velocity."""
+    return torch.cat((heat[:, None], heat.new_zeros(len(heat), PROPOSAL_DIM - 1)), 1)
 
 
 def proposed_offset(proposal: Tensor) -> Tensor:

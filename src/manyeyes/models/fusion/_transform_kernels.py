@@ -40,13 +40,13 @@ class GridCells(NamedTuple):
 
 
 class MovedTokens(NamedTuple):
-    """What tokens become: features (N, C), places (N, 2), pose contexts (N, 5), proposals (N, P), and their egos (N,)."""
+    """What tokens become: features (N, C), places (N, 2), pose contexts (N, 5), proposals (N, P), and their rows (N,) before."""
 
     features: F32x2
     xy: F32x2
     pose_context: F32x2
     proposal: F32x2
-    ego: I64x1
+    row: I64x1
 
 
 @njit(cache=True, nogil=True)
@@ -74,7 +74,7 @@ def move_tokens(
             else:
                 kept = _move_token(tokens[i], xy[i], link, np.float32(max_speed_mps), columns, grid, out, at)
             if kept:
-                out.ego[at] = np.int64(link[1])
+                out.row[at] = i
                 at += 1
     return at
 

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
-from torch import nn
+from torch import Tensor, nn
 
 from manyeyes.models.detector.transformer import AttentionConfig
+from manyeyes.models.fusion.by_cell import AbsentSenders, CellRows
+from manyeyes.models.fusion.cell_fusion import register_bare
 from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
 from manyeyes.models.fusion.registry import register_fusion
 from manyeyes.models.fusion.token_merge import FusedBev, TokenMerge, assign_cells
@@ -24,3 +26,16 @@ class MaxFusion(nn.Module):
         """Fuse the tokens of all agents to one feature and one box per cell; past is ignored."""
         key, place = assign_cells(tokens)
         return self.merge(self.encoding(tokens.features, tokens, place), tokens, key, place)
+
+
+@register_bare("max")
+class MaxRule(nn.Module):
+    """Channel-wise maximum over the senders of a cell; an absent sender is a row of zeros, or left out."""
+
+    def __init__(self, channels: int, attention: AttentionConfig, absent: AbsentSenders) -> None:
+        super().__init__()
+        self.absent: AbsentSenders = absent
+
+    def forward(self, rows: CellRows) -> Tensor:
+        """Fuse the rows to features (U, C) of the cells."""
+        return rows.max(self.absent)

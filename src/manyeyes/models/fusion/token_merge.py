@@ -40,6 +40,29 @@ class FusedBev:
         return FusedBev(self.bev.to(device), self.merged_proposals.to(device))
 
 
+@dataclass(frozen=True, eq=False)
+class MergedProposals:
+    """Merged boxes of the tokens of each cell, before features are fused.
+
+    Attributes:
+        sites: U cells.
+        row: (N,) int64, the cell of each token.
+        weight: (N, 1) of each token in its cell.
+        proposals: (U, PROPOSAL_DIM).
+        statistics: (U, C) to add to the fused features: number, joint score and spread of the tokens.
+    """
+
+    sites: Sites
+    row: Tensor
+    weight: Tensor
+    proposals: Tensor
+    statistics: Tensor
+
+    def with_features(self, features: Tensor) -> FusedBev:
+        """Return fused features (U, C) with the statistics added, and the merged proposals."""
+        return FusedBev(SparseBev(features + self.statistics, self.sites), self.proposals)
+
+
 def assign_cells(tokens: Tokens) -> tuple[Tensor, Tensor]:
     """Return the key (N,) of the cell of each token, and the token's offset (N, 2) from that cell's centre, in cells."""
     if is_plain(tokens.xy, tokens.proposal):
@@ -112,6 +135,18 @@ class TokenMerge(nn.Module):
             merged = merge_tokens(x, proposal, offset, context, drift, key.numpy(), size, self.folded, _MERGE_COLUMNS)
             found, features, merged_proposals = map(torch.from_numpy, merged)
             return FusedBev(SparseBev(features, Sites(found, tokens.grid, tokens.batch_size)), merged_proposals)
+        merged = self.merge_proposals(features, tokens, key, cell_offset)
+        row, n = merged.row, len(merged.sites)
+        features = features * tokens.selection_mask[:, None]
+        if self.reduce == "max":
+            reduced = segment_max(features, row, n)
+        else:
+            reduced = segment_sum(merged.weight * features, row, n)
+        return merged.with_features(reduced)
+
+    def merge_proposals(self, features: Tensor, tokens: Tokens, key: Tensor, cell_offset: Tensor) -> MergedProposals:
+        """Merge all but the features (N, C), which enter the weights alone; arguments as of forward."""
+        rows, columns = tokens.grid.shape
         found, row = distinct(key, tokens.batch_size * rows * columns)
         n = found.shape[0]
         boxes = reset_origin(tokens.proposal, cell_offset)
@@ -132,10 +167,8 @@ class TokenMerge(nn.Module):
         statistics = torch.cat(
             ((merged_proposals * PROPOSAL_SCALE.to(features.device))[:, : BOX_LAYOUT.velocity.start], met, apart), 1
         )
-        features = features * tokens.selection_mask[:, None]
-        merged = segment_max(features, row, n) if self.reduce == "max" else segment_sum(weight * features, row, n)
-        merged = merged + self.outer(torch.relu(self.inner(statistics)))
-        return FusedBev(SparseBev(merged, Sites(found, tokens.grid, tokens.batch_size)), merged_proposals)
+        sites = Sites(found, tokens.grid, tokens.batch_size)
+        return MergedProposals(sites, row, weight, merged_proposals, self.outer(torch.relu(self.inner(statistics))))
 
 
 def _proposal_scale() -> Tensor:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -44,6 +44,7 @@ class AgentTokens:
         sigma_xy_m: standard deviation of the reported position.
         sigma_yaw_rad: standard deviation of the reported heading.
         selection_mask: (n,) ones that carry the gradient of the selection; None without selection.
+        is_infrastructure: whether the sender is a roadside unit.
     """
 
     ego: int
@@ -54,6 +55,7 @@ class AgentTokens:
     sigma_xy_m: float = 0.0
     sigma_yaw_rad: float = 0.0
     selection_mask: Tensor | None = None
+    is_infrastructure: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +70,9 @@ class Tokens:
             age [100 ms]; zero for the ego's own current tokens.
         proposal: (N, PROPOSAL_DIM) in the ego's axes, relative to the token.
         selection_mask: (N,) as in AgentTokens.
+        sender: (N,) int64, 0 for the ego's own current tokens; each message and each earlier instant has a number of its own.
+        infrastructure: (N,) bool, whether the sender is a roadside unit.
+        sender_xy: (N, 2) positions in the sender's frame at the time of observation, metres.
     """
 
     features: Tensor
@@ -76,6 +81,9 @@ class Tokens:
     pose_context: Tensor
     proposal: Tensor
     selection_mask: Tensor
+    sender: Tensor
+    infrastructure: Tensor
+    sender_xy: Tensor
     grid: BevGrid
     batch_size: int
 
@@ -83,8 +91,11 @@ class Tokens:
         """Return the same tokens on a device."""
         if self.features.device == device:
             return self
-        names = ("features", "xy", "ego", "pose_context", "proposal", "selection_mask")
-        return replace(self, **{name: getattr(self, name).to(device) for name in names})
+        return replace(self, **{name: getattr(self, name).to(device) for name in TOKEN_COLUMNS})
+
+    def select(self, rows: Tensor) -> Tokens:
+        """Return the tokens of rows (n,) int64."""
+        return replace(self, **{name: getattr(self, name).index_select(0, rows) for name in TOKEN_COLUMNS})
 
     @property
     def sigma_m(self) -> Tensor:
@@ -95,6 +106,10 @@ class Tokens:
     def age(self) -> Tensor:
         """(N,) token ages in units of 100 ms, the time step of CoSTr Eq. 9."""
         return self.pose_context[:, 4]
+
+
+TOKEN_COLUMNS = tuple(f.name for f in fields(Tokens) if f.name not in ("grid", "batch_size"))
+"""Fields of Tokens with one row a token."""
 
 
 def rotate_vectors(features: Tensor, yaw: Tensor) -> Tensor:
@@ -122,12 +137,12 @@ def to_ego_frame(agent_tokens: Iterable[AgentTokens], grid: BevGrid, batch_size:
     if all(part.selection_mask is None and is_plain(part.tokens, part.xy) for part in parts):
         return _transform_in_loops(parts, grid, batch_size)
     sizes, device = [part.tokens.shape[0] for part in parts], parts[0].tokens.device
-    tokens, xy = torch.cat([part.tokens for part in parts]), torch.cat([part.xy for part in parts])
+    tokens, sender_xy = torch.cat([part.tokens for part in parts]), torch.cat([part.xy for part in parts])
     masks = [
         part.tokens.new_ones(size) if part.selection_mask is None else part.selection_mask
         for part, size in zip(parts, sizes)
     ]
-    number = torch.arange(len(parts), device="cpu").repeat_interleave(torch.tensor(sizes, device="cpu"))
+    number, xy = _part_numbers(parts), sender_xy
     # All numbers of all senders go to the device in one copy, and their tokens are transformed together.
     link = _describe_links(parts).to(device).index_select(0, number.to(device))
     feature, proposal = tokens[:, :-PROPOSAL_DIM], tokens[:, -PROPOSAL_DIM:]
@@ -135,7 +150,7 @@ def to_ego_frame(agent_tokens: Iterable[AgentTokens], grid: BevGrid, batch_size:
     velocity = proposed_velocity(proposal)
     driven = velocity * age_s * (velocity.norm(dim=1, keepdim=True) <= MAX_SPEED_MPS)
     xy = torch.where(age_s > 0, xy + driven, xy)
-    rotation, translation = link[:, 8:17].unflatten(1, (3, 3)), link[:, 17:]
+    rotation, translation = link[:, 8:17].unflatten(1, (3, 3)), link[:, 17:20]
     x, y = xy.double()[:, :1], xy.double()[:, 1:]
     moved = rotation[:, :, 0] * x + rotation[:, :, 1] * y + translation
     height = moved[:, 2].to(feature.dtype)
@@ -151,10 +166,12 @@ def to_ego_frame(agent_tokens: Iterable[AgentTokens], grid: BevGrid, batch_size:
         pose_context,
         turn_proposal(proposal, cosine, sine, height),
         torch.cat(masks),
+        link[:, 20].long(),
+        link[:, 21] > 0,
+        sender_xy,
     )
-    rows = (is_own | grid.contains(xy)).nonzero()[:, 0]
-    feature, xy, ego, pose_context, proposal, mask = (column.index_select(0, rows) for column in columns)
-    return Tokens(feature, xy, ego, pose_context, proposal, mask, grid, batch_size)
+    moved = Tokens(*columns, grid, batch_size)
+    return moved.select((is_own | grid.contains(xy)).nonzero()[:, 0])
 
 
 def is_plain(*tensors: Tensor) -> bool:
@@ -172,26 +189,46 @@ def grid_cells(grid: BevGrid) -> GridCells:
 
 
 def _transform_in_loops(parts: Sequence[AgentTokens], grid: BevGrid, batch_size: int) -> Tokens:
-    """As by tensors, without masks."""
+    """Transform as by tensors, without masks."""
     tokens, xy = torch.cat([part.tokens for part in parts]), torch.cat([part.xy for part in parts])
     widths = (tokens.shape[1] - PROPOSAL_DIM, 2, POSE_CONTEXT_DIM, PROPOSAL_DIM)
     columns = [xy.new_empty(len(xy), width) for width in widths]
-    ego = xy.new_empty(len(xy), dtype=torch.int64)
+    row = xy.new_empty(len(xy), dtype=torch.int64)
     features, places, context, proposal = (column.numpy() for column in columns)
-    out = MovedTokens(features, places, context, proposal, ego.numpy())
-    sizes, links = np.array([len(part.xy) for part in parts]), _describe_links(parts).numpy()
+    out = MovedTokens(features, places, context, proposal, row.numpy())
+    sizes, links = np.array([len(part.xy) for part in parts]), _describe_links(parts)
     count = move_tokens(
-        tokens.numpy(), xy.numpy(), sizes, links, MAX_SPEED_MPS, PROPOSAL_COLUMNS, grid_cells(grid), out
+        tokens.numpy(), xy.numpy(), sizes, links.numpy(), MAX_SPEED_MPS, PROPOSAL_COLUMNS, grid_cells(grid), out
     )
     features, places, context, proposal = (column[:count] for column in columns)
-    return Tokens(features, places, ego[:count], context, proposal, xy.new_ones(count), grid, batch_size)
+    row = row[:count]
+    ego, sender, infrastructure = links[:, [1, 20, 21]].long()[_part_numbers(parts)[row]].unbind(1)
+    mask, sender_xy = xy.new_ones(count), xy[row]
+    origin = (sender.contiguous(), infrastructure > 0, sender_xy)
+    return Tokens(features, places, ego.contiguous(), context, proposal, mask, *origin, grid, batch_size)
+
+
+def _part_numbers(parts: Sequence[AgentTokens]) -> Tensor:
+    """Return the number of the part (N,) int64 of each token, on the CPU."""
+    sizes = torch.tensor([part.tokens.shape[0] for part in parts], device="cpu")
+    return torch.arange(len(parts), device="cpu").repeat_interleave(sizes)
+
+
+def _number_senders(parts: Sequence[AgentTokens]) -> list[int]:
+    """Return 0 for each part of an ego's own current tokens, and for the others of each ego 1, 2, ... in their order."""
+    counts, numbers = dict[int, int](), list[int]()
+    for part in parts:
+        is_own = part.ego_from_sender is None
+        counts[part.ego] = counts.get(part.ego, 0) + (not is_own)
+        numbers.append(0 if is_own else counts[part.ego])
+    return numbers
 
 
 def _describe_links(parts: Sequence[AgentTokens]) -> Tensor:
-    """Return (parts, 20) float64 on the CPU.
+    """Return (parts, 22) float64 on the CPU.
 
     Whether the tokens are the ego's current ones, the number of the ego, age, both sigmas, sine, cosine and cosine - 1 of the
-    yaw, rotation (9), translation (3).
+    yaw, rotation (9), translation (3), the number of the sender, and whether it is a roadside unit.
     """
     own = Transform.identity()
     motions = [own if part.ego_from_sender is None else part.ego_from_sender.double() for part in parts]
@@ -200,5 +237,11 @@ def _describe_links(parts: Sequence[AgentTokens]) -> Tensor:
         (part.ego_from_sender is None, part.ego, part.age_s, part.sigma_xy_m, part.sigma_yaw_rad) for part in parts
     ]
     given = torch.tensor(numbers, dtype=torch.float64, device="cpu")
+    origin = torch.tensor(
+        [(number, part.is_infrastructure) for number, part in zip(_number_senders(parts), parts)],
+        dtype=torch.float64,
+        device="cpu",
+    )
     yaw = motion.yaw[:, None]
-    return torch.cat((given, yaw.sin(), yaw.cos(), yaw.cos() - 1, motion.rotation.flatten(1), motion.translation), 1)
+    turn = yaw.sin(), yaw.cos(), yaw.cos() - 1
+    return torch.cat((given, *turn, motion.rotation.flatten(1), motion.translation, origin), 1)

@@ -101,6 +101,7 @@ class AgentView:
         sigma_yaw_rad: standard deviation of the reported heading.
         loss_fraction: fraction of its tokens that are lost.
         max_tokens: budget in tokens, None without budget.
+        is_infrastructure: whether the agent is a roadside unit.
     """
 
     cloud: PointCloud
@@ -112,6 +113,7 @@ class AgentView:
     sigma_yaw_rad: float = 0.0
     loss_fraction: float = 0.0
     max_tokens: int | None = None
+    is_infrastructure: bool = False
 
 
 @dataclass(frozen=True)
@@ -299,9 +301,8 @@ class _AugmentedScene:
         true = truth.world_from_agent[row] @ self._agent_from_view(back, row)
         seen = truth.boxes[truth.seen[row] & (truth.boxes.id != agent_id)].transform(true.inverse())
         age_s = (self._moments[-1].frames[0].timestamp_ns - snapshot.frames[0].timestamp_ns) / 1e9
-        return AgentView(
-            now, self._previous_cloud(back, agent_id, pose), ego.inverse() @ _displaced(pose, off), age_s, seen
-        )
+        earlier, motion = self._previous_cloud(back, agent_id, pose), ego.inverse() @ _displaced(pose, off)
+        return AgentView(now, earlier, motion, age_s, seen, is_infrastructure=snapshot.frames[row].is_infrastructure)
 
     def merge(self, agent_ids: Sequence[int], ego: Transform, merged_gt_boxes: Boxes) -> AgentView:
         """Merge the current and previous clouds of all agents to one view of the ego."""

@@ -71,7 +71,7 @@ def forward(model: Detector, samples: list[Sample], prune_threshold: float | Non
         for ego, sample in enumerate(samples)
         for i, view in enumerate(sample.views)
     ]
-    parts = _deliver(shared, links, score, mask)
+    parts = _deliver(model.unpack_tokens(model.pack_tokens(shared)), links, score, mask)
     ego_history, sender_history = (
         _history_tokens(model, samples, which, prune_threshold) for which in ("ego_history", "sender_history")
     )
@@ -120,7 +120,8 @@ def _is_complete(view: AgentView) -> bool:
 def _agent_tokens(link: _Link, features: Tensor, xy: Tensor, mask: Tensor | None = None) -> AgentTokens:
     view = link.view
     motion = None if link.is_own else view.ego_from_view
-    return AgentTokens(link.ego, features, xy, motion, view.age_s, view.sigma_xy_m, view.sigma_yaw_rad, mask)
+    sigmas, roadside = (view.sigma_xy_m, view.sigma_yaw_rad), view.is_infrastructure
+    return AgentTokens(link.ego, features, xy, motion, view.age_s, *sigmas, mask, roadside)
 
 
 def count_sites(sites: Sites) -> list[int]:
@@ -161,7 +162,7 @@ def _history_tokens(
     shared = model.make_tokens(seen.tokens, model.predict(seen.tokens))
     keys = [(*samples[ego].key, _HISTORY_KEYS[which], number) for number, (ego, _) in enumerate(views)]
     links = [_Link(ego, view, key) for (ego, view), key in zip(views, keys)]
-    return _deliver(shared, links, model.score_tokens(shared), None)
+    return _deliver(model.unpack_tokens(model.pack_tokens(shared)), links, model.score_tokens(shared), None)
 
 
 def loss_terms(

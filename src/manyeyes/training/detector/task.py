@@ -139,8 +139,8 @@ class DetectorTask(Task[DetectorTrainConfig, Detector, Sample]):
         model.eval()
         views = (view for number in range(first, first + NUM_SAMPLES) for view in self.draw(number).views)
         with torch.inference_mode():
-            tokens = (model.extract_tokens(view.cloud, view.previous_cloud)[0].features for view in views)
-            peaks = measure_token_peaks(tokens, model.token_channels)
+            shared = (model.extract_tokens(view.cloud, view.previous_cloud)[0] for view in views)
+            peaks = measure_token_peaks((model.pack_tokens(t).features for t in shared), model.packed_channels)
         model.train(was)
         return {CARD_KEY: peaks, **write_sensor_domain(self._measure_sensors())}
 
