@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -11,7 +12,7 @@ import torch
 from torch import Tensor
 
 from manyeyes.agents.velocity import PastDetections, VelocityConfig, estimate_velocities
-from manyeyes.datatypes import Boxes, Transform
+from manyeyes.datatypes import Boxes, PointCloud, Transform
 
 CONFIG = VelocityConfig()
 EXACT = VelocityConfig(sigma_position_m=1e-3)
@@ -51,13 +52,18 @@ def test_two_places_by_hand() -> None:
     assert estimate_velocities(now, drive((10, 0), 1), config)[0].tolist() == pytest.approx([want, 0], abs=1e-4)
 
 
-def plain(now: Boxes, places: list[Tensor], sigmas: list[float], config: VelocityConfig) -> Tensor:
-    """Reference implementation for one box: start and velocity of one line by least squares, a row for everything known."""
+def plain_line(
+    now: Boxes, known: list[tuple[Tensor, int, float]], config: VelocityConfig
+) -> tuple[Callable[[float], Tensor], Tensor]:
+    """Slow twin for one box: one line by least squares, a row for everything known; its place at a time, and its velocity.
+
+    known: place, sweeps ago, standard deviation of the box; the current one first.
+    """
     ahead = torch.stack((now.yaw.cos(), now.yaw.sin()), 1)[0].double()
     aside = torch.stack((-ahead[1], ahead[0]))
     rows, goals = [], []
-    for k, place in enumerate([now.center[0, :2], *places]):
-        sigma = math.hypot(config.sigma_position_m, sigmas[k])
+    for place, k, box_sigma in known:
+        sigma = math.hypot(config.sigma_position_m, box_sigma)
         for axis in range(2):
             row = torch.zeros(4).double()
             row[axis], row[2 + axis] = 1, -0.1 * k
@@ -70,7 +76,8 @@ def plain(now: Boxes, places: list[Tensor], sigmas: list[float], config: Velocit
     ):
         rows.append(torch.cat((torch.zeros(2).double(), direction)) / sigma)
         goals.append(torch.as_tensor(goal / sigma).double())
-    return torch.linalg.lstsq(torch.stack(rows), torch.stack(goals)[:, None]).solution[2:, 0]
+    line = torch.linalg.lstsq(torch.stack(rows), torch.stack(goals)[:, None]).solution[:, 0]
+    return lambda t: line[:2] + line[2:] * t, line[2:]
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -83,7 +90,48 @@ def test_the_line_fit_is_least_squares(seed: int) -> None:
     config = VelocityConfig(gate_m=9.0, min_speed_mps=0.0, min_z_score=0.0)
     then = [PastDetections(with_sigma(cars(p[None]), sigmas[k + 1]), 0.1 * (k + 1)) for k, p in enumerate(places)]
     got = estimate_velocities(with_sigma(now, sigmas[0]), then, config)[0]
-    assert torch.allclose(got.double(), plain(now, places, sigmas, config), atol=1e-3)
+    known = [(place, k, sigmas[k]) for k, place in enumerate([now.center[0, :2], *places])]
+    assert torch.allclose(got.double(), plain_line(now, known, config)[1], atol=1e-3)
+
+
+def plain_partners(expected: Tensor, places: Tensor, gate_m: float) -> list[int | None]:
+    """Slow twin of the association: mutual nearest neighbours within the gate."""
+    apart = (expected[:, None].double() - places[None].double()).norm(dim=2)
+    nearest = apart.argmin(1).tolist()
+    return [
+        j if int(apart[:, j].argmin()) == i and float(apart[i, j]) <= gate_m else None for i, j in enumerate(nearest)
+    ]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_velocities_of_many_boxes_are_those_of_the_slow_twin(seed: int) -> None:
+    """Earlier boxes are in their own frames; one in four is missing, the first box's always, and false ones lie between."""
+    rng = torch.Generator().manual_seed(seed)
+    config = VelocityConfig(min_speed_mps=0.0, min_z_score=0.0)
+    count, drive = 24, torch.tensor([9.0, 2.0])
+    spots = torch.cat((torch.tensor([[60.0, 60.0]]), torch.rand(count - 1, 2, generator=rng) * 60 - 30))
+    now = cars(spots, 0.4, drive + torch.randn(count, 2, generator=rng))
+    now = replace(now, sigma_xy=0.3 * torch.rand(count, generator=rng))
+    past, known = [], [[(now.center[i, :2], 0, float(now.sigma_xy[i]))] for i in range(count)]
+    velocity = [plain_line(now[i : i + 1], known[i], config)[1] for i in range(count)]
+    for k in range(1, 6):
+        kept = (torch.rand(count, generator=rng) > 0.25) & (torch.arange(count) > 0)
+        places = now.center[kept, :2] - 0.1 * k * drive + 0.1 * torch.randn(int(kept.sum()), 2, generator=rng)
+        places = torch.cat((places, torch.rand(8, 2, generator=rng) * 60 - 30))
+        then = replace(cars(places), sigma_xy=0.3 * torch.rand(len(places), generator=rng))
+        motion = Transform.from_xyz_yaw(0.8 * k, -0.1 * k, 0.0, 0.03 * k)
+        there = then.to(torch.float64).transform(motion.inverse()).to(torch.float32)
+        past.append(PastDetections(there, 0.1 * k, now_from_then=motion))
+        expected = torch.stack([plain_line(now[i : i + 1], known[i], config)[0](-0.1 * k) for i in range(count)])
+        for i, j in enumerate(plain_partners(expected, places, config.gate_m)):
+            if j is not None:
+                known[i].append((places[j], k, float(then.sigma_xy[j])))
+                velocity[i] = plain_line(now[i : i + 1], known[i], config)[1]
+    assert min(map(len, known)) == 1 and max(map(len, known)) == 6
+    got = estimate_velocities(now, past, config)
+    for i, rows in enumerate(known):
+        want = velocity[i] if len(rows) > 1 else now.velocity[i].double()
+        assert torch.allclose(got[i].double(), want, atol=1e-3), (i, got[i], want)
 
 
 def test_velocities_turn_with_the_frame() -> None:
@@ -149,9 +197,7 @@ def test_points_correct_a_wrong_longitudinal_speed(speed: float) -> None:
     """Boxes creep ahead by 15 cm a sweep, which is 1.5 m/s; points do not."""
     now, earlier = cars([(0.0, 0.0)]), []
     for t in (0.1, 0.2, 0.3, 0.4, 0.5):
-        earlier.append(
-            PastDetections(cars([(-(speed + 1.5) * t, 0.0)]), t, body(-speed * t) if t in (0.2, 0.3) else None)
-        )
+        earlier.append(PastDetections(cars([(-(speed + 1.5) * t, 0.0)]), t, PointCloud.of(body(-speed * t))))
     by_boxes = float(estimate_velocities(now, earlier, CONFIG)[0, 0])
     by_points = float(estimate_velocities(now, earlier, CONFIG, body(0.0))[0, 0])
     assert by_boxes > speed + 0.8
@@ -159,7 +205,7 @@ def test_points_correct_a_wrong_longitudinal_speed(speed: float) -> None:
 
 
 def test_without_points_velocities_follow_from_boxes() -> None:
-    now, earlier = cars([(0, 0)]), [replace(e, points=torch.zeros(0, 3)) for e in drive((8, 0), 5)]
+    now, earlier = cars([(0, 0)]), [replace(e, points=PointCloud.of(torch.zeros(0, 3))) for e in drive((8, 0), 5)]
     assert torch.equal(
         estimate_velocities(now, earlier, CONFIG, torch.zeros(0, 3)), estimate_velocities(now, earlier, CONFIG)
     )

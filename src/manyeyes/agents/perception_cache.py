@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from manyeyes.agents._velocity_kernels import nearest_boxes
 from manyeyes.agents.level_frame import FrameLeveller
 from manyeyes.agents.velocity import DEFAULT_VELOCITY_CONFIG, PastDetections, VelocityConfig, estimate_velocities
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, SparseBev
-from manyeyes.models.detector.box_head import SPEED_UNIT, DecodeConfig, RawBoxes, decode
-from manyeyes.models.detector.proposal import PROPOSAL_DIM, make_proposals
+from manyeyes.models.detector.box_head import BOX_LAYOUT, SPEED_UNIT, DecodeConfig, RawBoxes, decode
+from manyeyes.models.detector.proposal import MAX_PROPOSAL, PROPOSAL_DIM
 from manyeyes.models.detector.protocols import BoxDetector, TokenDetector, has_tokens, require_tokens
 from manyeyes.models.fusion.token_merge import FusedBev
 from manyeyes.models.fusion.transform_tokens import AgentTokens, Tokens
@@ -62,12 +63,13 @@ class TokenOutput:
     def with_velocity(self, velocity: Tensor) -> TokenOutput:
         """Return the same output with box velocities (M, 2) m/s, for their tokens too; tokens without a box get velocity 0."""
         place = self.raw.sites.xy + self.raw.offset * self.raw.sites.grid.cell_size_m
-        distance = torch.cdist(place, self.boxes.center[:, :2])
-        # One more column for tokens without a box.
-        nearest = pad(distance, (0, 1), value=MAX_TOKEN_TO_BOX_M).argmin(1)
-        raw = replace(self.raw, velocity=pad(velocity, (0, 0, 0, 1))[nearest] / SPEED_UNIT)
-        features = torch.cat((self.shared_tokens.features[:, :-PROPOSAL_DIM], make_proposals(raw)), 1)
-        output = replace(self, shared_tokens=self.shared_tokens.with_features(features), raw=raw)
+        nearest = nearest_boxes(place.float().numpy(), self.boxes.center.float().numpy(), MAX_TOKEN_TO_BOX_M)
+        # One more row for tokens without a box.
+        of_token = pad(velocity, (0, 0, 0, 1))[torch.from_numpy(nearest)] / SPEED_UNIT
+        features = self.shared_tokens.features.clone()
+        features[:, -PROPOSAL_DIM:][:, BOX_LAYOUT.velocity] = of_token.clamp(-MAX_PROPOSAL, MAX_PROPOSAL)
+        tokens = self.shared_tokens.with_features(features)
+        output = replace(self, shared_tokens=tokens, raw=replace(self.raw, velocity=of_token))
         # Decoding does not depend on velocity: reuse the decoded boxes.
         vars(output)["boxes"] = replace(self.boxes, velocity=velocity)
         return output
@@ -138,17 +140,16 @@ class PerceptionCache:
         """Return the output with velocities estimated over the last frames that have boxes."""
         if self._velocity_config is None:
             return output
-        earlier = []
-        for before, past_output in self._outputs[: -TRACK_FRAMES - 1 : -1]:
-            if len(past_output.boxes):
-                age_s, motion = (frame.timestamp_ns - before.timestamp_ns) / 1e9, frame.now_from_earlier(before)
-                match_points = (
-                    self._velocity_config.point_match_window_s[0]
-                    <= age_s
-                    <= self._velocity_config.point_match_window_s[1]
-                )
-                points = before.points.transform(motion).xyz if match_points else None
-                earlier.append(PastDetections(past_output.boxes.transform(motion).to(torch.float32), age_s, points))
+        earlier = [
+            PastDetections(
+                past_output.boxes.to(torch.float32),
+                (frame.timestamp_ns - before.timestamp_ns) / 1e9,
+                before.points,
+                frame.now_from_earlier(before),
+            )
+            for before, past_output in self._outputs[: -TRACK_FRAMES - 1 : -1]
+            if len(past_output.boxes)
+        ]
         if not earlier:
             return output
         return output.with_velocity(estimate_velocities(output.boxes, earlier, self._velocity_config, frame.points.xyz))

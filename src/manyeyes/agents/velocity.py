@@ -11,15 +11,26 @@ box's points of this sweep and of earlier ones (``ops.point_alignment_cost``). I
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from manyeyes.datatypes import Boxes
+from manyeyes.agents._velocity_kernels import (
+    BoxColumns,
+    FitLimits,
+    LineFits,
+    PastColumns,
+    choose_candidates,
+    fit_lines,
+    longitudinal_sigmas,
+    significant_velocities,
+)
+from manyeyes.datatypes import Boxes, PointCloud, Transform
 from manyeyes.ops.point_alignment_cost import MAX_POINTS, compute_alignment_costs
 
-LONGITUDINAL_SIGMAS = torch.linspace(-3.0, 3.0, 31)
+LONGITUDINAL_SIGMAS = np.linspace(-3.0, 3.0, 31)
 """Longitudinal search offsets, in standard deviations of the line fit."""
 
 
@@ -49,11 +60,15 @@ DEFAULT_VELOCITY_CONFIG = VelocityConfig()
 
 @dataclass(frozen=True)
 class PastDetections:
-    """Detections of an earlier frame, in the current frame: boxes, and points (Q, 3) float32 where points are aligned."""
+    """Detections of an earlier frame. boxes: float32 on the CPU. points: of its sweep, float32; None aligns no points.
+
+    now_from_then: from its frame to the current one; None: it is the same frame.
+    """
 
     boxes: Boxes
     age_s: float
-    points: Tensor | None = None
+    points: PointCloud | None = None
+    now_from_then: Transform | None = None
 
 
 def estimate_velocities(
@@ -65,94 +80,58 @@ def estimate_velocities(
     Boxes are associated as mutual nearest neighbours of the propagated positions, within the gate. points: (P, 3) float32 of this
     sweep; None uses boxes only.
     """
-    if not len(boxes):
+    past = [then for then in past if len(then.boxes)]
+    if not len(boxes) or not past:
         return boxes.velocity
-    line = _LineFit.from_boxes(boxes, config)
-    for then in past:
-        if len(then.boxes):
-            distance = torch.cdist(line.position_at(-then.age_s), then.boxes.center[:, :2])
-            nearest = distance.argmin(1)
-            mutual = distance.argmin(0)[nearest] == torch.arange(len(boxes))
-            same = mutual & (distance.gather(1, nearest[:, None])[:, 0] <= config.gate_m)
-            line = line.add(then.boxes[nearest], -then.age_s, same)
-    information, velocity, associated = line.information, line.velocity, line.sums[:, 2] > 0
+    yaw, detected = boxes.yaw.float().numpy(), boxes.velocity.float().numpy()
+    limits = FitLimits(
+        config.gate_m,
+        config.sigma_position_m,
+        config.sigma_detected_velocity_mps,
+        config.sigma_lateral_velocity_mps,
+    )
+    fit = fit_lines(_columns([boxes]), yaw, detected, _past_columns(past), limits)
     if points is not None:
-        matched = _match_points(boxes[associated], velocity[associated], information[associated], past, points, config)
-        velocity = velocity.index_put((associated,), matched)
-    significant = (velocity[:, None] @ information @ velocity[:, :, None])[:, 0, 0] >= config.min_z_score**2
-    moves = significant & (velocity.norm(dim=1) >= config.min_speed_mps)
-    return torch.where(associated[:, None], velocity * moves[:, None], boxes.velocity)
+        _match_points(fit, boxes, past, points, config)
+    velocity = significant_velocities(fit, detected, config.min_z_score, config.min_speed_mps)
+    return torch.from_numpy(velocity).to(boxes.velocity.dtype)
+
+
+def _columns(many: Sequence[Boxes]) -> BoxColumns:
+    return BoxColumns(
+        torch.cat([boxes.center for boxes in many]).float().numpy(),
+        torch.cat([boxes.sigma_xy for boxes in many]).float().numpy(),
+    )
+
+
+def _past_columns(past: Sequence[PastDetections]) -> PastColumns:
+    motions = np.zeros((len(past), 2, 4))
+    motions[:, :, :2] = np.eye(2)
+    for row, then in zip(motions, past):
+        if then.now_from_then is not None:
+            row[:, :3] = then.now_from_then.rotation[:2].numpy()
+            row[:, 3] = then.now_from_then.translation[:2].numpy()
+    start = np.cumsum([0, *(len(then.boxes) for then in past)])
+    return PastColumns(_columns([then.boxes for then in past]), start, motions, np.array([then.age_s for then in past]))
 
 
 def _match_points(
-    boxes: Boxes,
-    velocity: Tensor,
-    information: Tensor,
-    past: Sequence[PastDetections],
-    points: Tensor,
-    config: VelocityConfig,
-) -> Tensor:
-    """Return velocities (N, 2) of minimum alignment cost around the given ones; information: as in _LineFit."""
-    longitudinal = torch.stack((boxes.yaw.cos(), boxes.yaw.sin()), 1)
-    variance = (longitudinal[:, None] @ torch.linalg.inv(information) @ longitudinal[:, :, None])[:, 0, 0]
-    sigma = variance.sqrt().clamp_max(config.sigma_detected_velocity_mps)
-    cost = (LONGITUDINAL_SIGMAS**2).to(velocity.dtype).expand(len(boxes), -1)
-    for then in past:
-        if then.points is not None:
-            t = then.age_s
-            missed, num_compared = compute_alignment_costs(
-                points, then.points, boxes, velocity * t, LONGITUDINAL_SIGMAS[-1] * sigma * t, len(LONGITUDINAL_SIGMAS)
-            )
-            cost = cost + config.point_match_weight * (num_compared / MAX_POINTS)[:, None] * missed
-    return velocity + (sigma * LONGITUDINAL_SIGMAS[cost.argmin(1)])[:, None] * longitudinal
-
-
-@dataclass(frozen=True)
-class _LineFit:
-    """N lines through box positions, as the sums of least squares. Times are relative to now, positions to each box.
-
-    sums: (N, 3), over places, of w, w t, w t^2 with w the inverse variance of a place; moments: (N, 2, 2) of w p, w t p.
-    prior_information: (N, 2, 2), inverse covariance of the velocity beforehand; prior_vector: (N, 2), it times the mean.
-    """
-
-    origin: Tensor
-    sums: Tensor
-    moments: Tensor
-    prior_information: Tensor
-    prior_vector: Tensor
-    sigma_position_m: float
-
-    @classmethod
-    def from_boxes(cls, boxes: Boxes, config: VelocityConfig) -> _LineFit:
-        """Return the fit of the current positions and the prior."""
-        n, ahead = len(boxes), torch.stack((boxes.yaw.cos(), boxes.yaw.sin()), 1)
-        longitudinal = ahead[:, :, None] * ahead[:, None, :]
-        lateral = torch.eye(2) - longitudinal
-        prior = longitudinal / config.sigma_detected_velocity_mps**2 + lateral / config.sigma_lateral_velocity_mps**2
-        pull = (longitudinal @ boxes.velocity[:, :, None])[..., 0] / config.sigma_detected_velocity_mps**2
-        empty = cls(boxes.center[:, :2], torch.zeros(n, 3), torch.zeros(n, 2, 2), prior, pull, config.sigma_position_m)
-        return empty.add(boxes, 0.0, torch.ones(n, dtype=torch.bool))
-
-    def add(self, boxes: Boxes, t: float, same: Tensor) -> _LineFit:
-        """Return the fit with one more position for each associated box; same: (N,) bool."""
-        weight = same / (self.sigma_position_m**2 + boxes.sigma_xy**2)
-        powers = weight[:, None] * torch.tensor([1.0, t, t * t])
-        moments = powers[:, :2, None] * (boxes.center[:, :2] - self.origin)[:, None]
-        return replace(self, sums=self.sums + powers, moments=self.moments + moments)
-
-    @property
-    def information(self) -> Tensor:
-        """(N, 2, 2): the inverse covariance of the velocity."""
-        w, wt, wtt = self.sums.unbind(1)
-        return self.prior_information + (wtt - wt * wt / w)[:, None, None] * torch.eye(2)
-
-    @property
-    def velocity(self) -> Tensor:
-        """Estimated velocities (N, 2), m/s."""
-        slope = self.moments[:, 1] - self.moments[:, 0] * (self.sums[:, 1] / self.sums[:, 0])[:, None]
-        return torch.linalg.solve(self.information, self.prior_vector + slope)
-
-    def position_at(self, t: float) -> Tensor:
-        """Return positions (N, 2) of the boxes at time t."""
-        w, wt = self.sums[:, 0, None], self.sums[:, 1, None]
-        return self.origin + self.moments[:, 0] / w + self.velocity * (t - wt / w)
+    fit: LineFits, boxes: Boxes, past: Sequence[PastDetections], points: Tensor, config: VelocityConfig
+) -> None:
+    """Change the associated velocities to those of minimum alignment cost around them."""
+    first, last = config.point_match_window_s
+    sweeps = [(then, then.points) for then in past if then.points is not None and first <= then.age_s <= last]
+    if not sweeps or not fit.associated.any():
+        return
+    yaw, rows = boxes.yaw.float().numpy(), np.flatnonzero(fit.associated)
+    sigma = longitudinal_sigmas(fit, yaw, config.sigma_detected_velocity_mps)
+    cost = np.tile(LONGITUDINAL_SIGMAS**2, (len(boxes), 1))
+    found, velocity = boxes[torch.from_numpy(rows)], torch.from_numpy(fit.velocity[rows])
+    reach = torch.from_numpy(LONGITUDINAL_SIGMAS[-1] * sigma[rows])
+    for then, earlier in sweeps:
+        moved = earlier if then.now_from_then is None else earlier.transform(then.now_from_then)
+        missed, num_compared = compute_alignment_costs(
+            points, moved.xyz, found, velocity * then.age_s, reach * then.age_s, len(LONGITUDINAL_SIGMAS)
+        )
+        cost[rows] += (config.point_match_weight * (num_compared / MAX_POINTS)[:, None] * missed).numpy()
+    choose_candidates(fit, yaw, sigma, LONGITUDINAL_SIGMAS, cost)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from manyeyes._jit import F32x2, F64x1, F64x2, I32x1, I64x1, njit
+from manyeyes._jit import F32x1, F32x2, F64x1, F64x2, I32x1, I64x1, njit
 from manyeyes.datatypes import Boxes
 
 MAX_DISTANCE_M = 0.4
@@ -26,6 +26,8 @@ ROAD_CLEARANCE_M = 0.25
 """Points nearer to the bottom of a box are the road's."""
 HEIGHT_SCALE = 0.5
 """Height counts so much: rings of a LiDAR meet a body at other heights as it drives away."""
+_LANES = 16
+"""Candidates are tried in whole vectors of so many."""
 _CELL_M = 2.0
 _CELLS = 128
 """Number of cells on each axis of the index of points, which is centred at the origin; border cells hold all points beyond."""
@@ -38,7 +40,8 @@ def compute_alignment_costs(
 
     now: (P, 3), then: (Q, 3), float32 metres, in the frame of boxes (N). Candidate k has it that an object was ``back`` (N, 2) and
     d_k along its length behind where it is, d evenly from -slack to slack (N,). The cost is the mean over its points now of
-    min(1, (distance / REACH_M)^2) to the nearest one then, moved by that much. 0, of no points, where either sweep has too few.
+    min(1, (distance / MAX_DISTANCE_M)^2) to the nearest one then, moved by that much. 0, of no points, where either sweep
+    has too few.
     """
     cost, count = np.zeros((len(boxes), steps)), np.zeros(len(boxes), np.int64)
     place = torch.cat((boxes.center, boxes.yaw.cos()[:, None], boxes.yaw.sin()[:, None], boxes.size / 2), 1)
@@ -48,8 +51,10 @@ def compute_alignment_costs(
     return torch.from_numpy(cost).to(back.dtype), torch.from_numpy(count)
 
 
-class _Box(NamedTuple):
-    """A box in metres: its centre, cosine and sine of its yaw, and half its sizes."""
+class _Region(NamedTuple):
+    """An oriented box that points are taken from, metres: its centre, cosine and sine of its yaw, half its length and width, and
+    the heights above its centre.
+    """
 
     x: float
     y: float
@@ -58,7 +63,15 @@ class _Box(NamedTuple):
     sin_yaw: float
     half_length: float
     half_width: float
-    half_height: float
+    bottom: float
+    top: float
+
+
+class _Found(NamedTuple):
+    """Points in a region: rows of the cloud, and from the centre in the region's axes, heights scaled, (3, P); P: room for all."""
+
+    rows: I32x1
+    xyz: F32x2
 
 
 class _PointCells(NamedTuple):
@@ -93,75 +106,70 @@ def _index_points(points: F32x2) -> _PointCells:  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _inside(
-    cells: _PointCells, place: _Box, away_x: float, away_y: float, longitudinal_margin: float
-) -> F64x2:  # pragma: no cover
-    """Return (K, 3): points in a box moved by away and made longer at each end, from its middle, in its axes, heights scaled.
-
-    They are in the order of the cloud.
-    """
+def _find_inside(cells: _PointCells, region: _Region, out: _Found) -> int:  # pragma: no cover
+    """Write the points in a region to out, by cells; how many."""
     points, start, order = cells
-    x0, y0 = place.x + away_x, place.y + away_y
-    length, width, height = (
-        place.half_length + longitudinal_margin,
-        place.half_width + BOX_MARGIN_M[1],
-        place.half_height,
-    )
-    reach_x = length * abs(place.cos_yaw) + width * abs(place.sin_yaw)
-    reach_y = length * abs(place.sin_yaw) + width * abs(place.cos_yaw)
-    first, last = _cell_at(x0 - reach_x), _cell_at(x0 + reach_x)
-    rows = np.empty(len(points), np.int32)
-    count = 0
+    x0, y0, z0, c, s, length, width, bottom, top = region
+    reach_x, reach_y = length * abs(c) + width * abs(s), length * abs(s) + width * abs(c)
+    first, last, count = _cell_at(x0 - reach_x), _cell_at(x0 + reach_x), 0
     for row in range(_cell_at(y0 - reach_y), _cell_at(y0 + reach_y) + 1):
         for k in range(start[row * _CELLS + first], start[row * _CELLS + last + 1]):
             p = order[k]
-            x, y, z = points[p, 0] - x0, points[p, 1] - y0, points[p, 2] - place.z
-            u, v = x * place.cos_yaw + y * place.sin_yaw, y * place.cos_yaw - x * place.sin_yaw
-            if abs(u) < length and abs(v) < width and ROAD_CLEARANCE_M - height < z < height + BOX_MARGIN_M[2]:
-                rows[count] = p
+            x, y, z = points[p, 0] - x0, points[p, 1] - y0, points[p, 2] - z0
+            u, v = x * c + y * s, y * c - x * s
+            if abs(u) < length and abs(v) < width and bottom < z < top:
+                out.rows[count] = p
+                out.xyz[0, count], out.xyz[1, count], out.xyz[2, count] = u, v, HEIGHT_SCALE * z
                 count += 1
-    found, kept = np.empty((count, 3)), np.sort(rows[:count])
-    for k in range(count):
-        x, y, z = points[kept[k], 0] - x0, points[kept[k], 1] - y0, points[kept[k], 2] - place.z
-        found[k, 0], found[k, 1] = x * place.cos_yaw + y * place.sin_yaw, y * place.cos_yaw - x * place.sin_yaw
-        found[k, 2] = HEIGHT_SCALE * z
-    return found
+    return count
 
 
 @njit(cache=True, nogil=True)
 def _match(
     now: F32x2, then: F32x2, places: F64x2, back: F64x2, slack: F64x1, cost: F64x2, count: I64x1
 ) -> None:  # pragma: no cover
-    """Fills cost (N, S) and count (N,); places (N, 8): the fields of a :class:`_Box`."""
-    steps, limit = cost.shape[1], MAX_DISTANCE_M * MAX_DISTANCE_M
-    x, best = np.empty(steps), np.empty(steps)
+    """Fills cost (N, S) and count (N,); places (N, 8): centre, cosine and sine of the yaw, half sizes."""
+    steps, limit = cost.shape[1], np.float32(MAX_DISTANCE_M * MAX_DISTANCE_M)
+    # Whole vectors of candidates; those beyond the last are not read.
+    offset = np.empty((steps + _LANES - 1) // _LANES * _LANES, np.float32)
+    best = np.empty_like(offset)
     cells_now, cells_then = _index_points(now), _index_points(then)
+    mine = _Found(np.empty(len(now), np.int32), np.empty((3, len(now)), np.float32))
+    theirs = _Found(np.empty(len(then), np.int32), np.empty((3, len(then)), np.float32))
     for n in range(len(places)):
-        p = places[n]
-        box = _Box(p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7])
-        mine = _inside(cells_now, box, 0.0, 0.0, BOX_MARGIN_M[0])
-        theirs = _inside(cells_then, box, -back[n, 0], -back[n, 1], BOX_MARGIN_M[0] + slack[n])
-        if len(mine) < MIN_POINTS or len(theirs) < MIN_POINTS:
+        x, y, z, c, s, length, width, height = places[n]
+        length, width = length + BOX_MARGIN_M[0], width + BOX_MARGIN_M[1]
+        bottom, top = ROAD_CLEARANCE_M - height, height + BOX_MARGIN_M[2]
+        found = _find_inside(cells_now, _Region(x, y, z, c, s, length, width, bottom, top), mine)
+        if found < MIN_POINTS:
             continue
-        asked = min(len(mine), MAX_POINTS)
-        count[n] = asked
-        apart = 2.0 * slack[n] / (steps - 1)
-        for a in range(asked):
-            point = mine[a * len(mine) // asked]
-            for s in range(steps):
-                x[s], best[s] = point[0] - slack[n] * (2.0 * s / (steps - 1) - 1.0), limit
-            for b in range(len(theirs)):
-                dy, dz = theirs[b, 1] - point[1], theirs[b, 2] - point[2]
-                dy, dz = dy * dy, dz * dz
-                if dy + dz >= limit:
-                    continue
-                # The candidates at which it may be within reach: one more on each side, for rounding.
-                gap, first, last = theirs[b, 0] - point[0] - slack[n], 0, steps - 1
-                if apart > 0.0:
-                    first = max(first, int((-MAX_DISTANCE_M - gap) / apart) - 1)
-                    last = min(last, int((MAX_DISTANCE_M - gap) / apart) + 1)
-                for s in range(first, last + 1):
-                    dx = theirs[b, 0] - x[s]
-                    best[s] = min(best[s], dx * dx + dy + dz)
-            for s in range(steps):
-                cost[n, s] += best[s] / limit / asked
+        moved = _Region(x - back[n, 0], y - back[n, 1], z, c, s, length + slack[n], width, bottom, top)
+        partners = _find_inside(cells_then, moved, theirs)
+        if partners < MIN_POINTS:
+            continue
+        count[n] = min(found, MAX_POINTS)
+        by_row = np.argsort(mine.rows[:found])
+        for k in range(len(offset)):
+            offset[k] = slack[n] * (2.0 * k / (steps - 1) - 1.0)
+        for a in range(count[n]):
+            k = by_row[a * found // count[n]]
+            best[:] = limit
+            _find_nearest(theirs.xyz, partners, mine.xyz[0, k], mine.xyz[1, k], mine.xyz[2, k], offset, best)
+            for k in range(steps):
+                cost[n, k] += best[k] / limit / count[n]
+
+
+@njit(cache=True, nogil=True, fastmath={"nnan", "nsz", "contract"})
+def _find_nearest(
+    xyz: F32x2, count: int, x: np.float32, y: np.float32, z: np.float32, offset: F32x1, best: F32x1
+) -> None:  # pragma: no cover
+    """Lower best (S,) to the squared distance of the nearest of the first points (3, P) to one that is moved by -offset (S,)."""
+    limit = np.float32(MAX_DISTANCE_M * MAX_DISTANCE_M)
+    for b in range(count):
+        dy, dz = xyz[1, b] - y, xyz[2, b] - z
+        aside = dy * dy + dz * dz
+        if aside < limit:
+            ahead = xyz[0, b] - x
+            for k in range(offset.shape[0]):
+                dx = ahead + offset[k]
+                best[k] = min(best[k], dx * dx + aside)

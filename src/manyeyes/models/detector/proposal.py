@@ -19,11 +19,13 @@ PROPOSAL_DIM = BOX_LAYOUT.total
 """Number of proposal columns: those of RawBoxes, in its order."""
 NO_HEAT_LOGIT = -16.0
 """Heat of tokens that were sent without proposal and without confidence."""
+MAX_PROPOSAL = 16.0
+"""Largest magnitude of a value of a proposal."""
 
 
 def make_proposals(raw: RawBoxes) -> Tensor:
     """Return proposals (N, PROPOSAL_DIM) from the head's outputs, without gradient."""
-    return raw.to_rows().detach().clamp(-16, 16)
+    return raw.to_rows().detach().clamp(-MAX_PROPOSAL, MAX_PROPOSAL)
 
 
 def make_bare_proposals(heat: Tensor) -> Tensor:
