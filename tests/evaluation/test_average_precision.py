@@ -23,7 +23,9 @@ from manyeyes.evaluation.detection.average_precision import (
     FrameResult,
     average_precision,
     average_precisions,
+    compute_ap,
     compute_frame_iou,
+    compute_frame_ious,
     filter_detections,
     get_protocol,
     match_frame,
@@ -72,26 +74,38 @@ def test_several_thresholds_at_once():
     assert together[0].ap_global > together[2].ap_global
 
 
-def slow_ap(frames, thr, global_sort):
-    """The slow twin, in plain loops, with the padded VOC area."""
-    rows, n_gt = [], 0
-    for frame in sorted(frames, key=lambda f: (f.scenario, f.index)):
-        left = list(range(len(frame.truth)))
-        n_gt += len(left)
-        for d in sorted(range(len(frame.detections)), key=lambda i: (-frame.detections.score[i].item(), i)):
-            best = [
-                (pairwise_iou(frame.detections[d : d + 1].bev(), frame.truth[g : g + 1].bev()).item(), -g) for g in left
-            ]
-            hit = bool(best) and max(best)[0] >= thr
+def slow_matches(frame, thr):
+    """(score, whether it is a hit) of each detection of a frame, by falling score; of equals the best pair is taken first."""
+    found, truth, out = frame.detections, frame.truth, []
+    left = list(range(len(truth)))
+    for score in sorted(set(found.score.tolist()), reverse=True):
+        waiting = [d for d in range(len(found)) if found.score[d].item() == score]
+        while waiting:
+            overlaps = {
+                (d, g): pairwise_iou(found[d : d + 1].bev(), truth[g : g + 1].bev()).item()
+                for d in waiting
+                for g in left
+            }
+            best = max(overlaps, key=overlaps.__getitem__, default=None)
+            hit = best is not None and overlaps[best] >= thr
             if hit:
-                left.remove(-max(best)[1])
-            rows.append((frame.detections.score[d].item(), hit))
-    if global_sort:
-        rows.sort(key=lambda r: -r[0])
+                left.remove(best[1])
+            waiting.remove(best[0] if hit else waiting[-1])
+            out.append((score, hit))
+    return out
+
+
+def slow_ap(frames, thr, global_sort):
+    """The slow twin, in plain loops, with the padded VOC area; equal scores (of one frame, unless sorted) are one step."""
+    steps, n_gt = [], 0
+    for k, frame in enumerate(sorted(frames, key=lambda f: (f.scenario, f.index))):
+        n_gt += len(frame.truth)
+        steps += [((0 if global_sort else k, -score), hit) for score, hit in slow_matches(frame, thr)]
     tp = fp = 0
     recall, precision = [0.0], [0.0]
-    for _, hit in rows:
-        tp, fp = tp + hit, fp + (not hit)
+    for key in sorted({key for key, _ in steps}):
+        hits = [hit for other, hit in steps if other == key]
+        tp, fp = tp + sum(hits), fp + len(hits) - sum(hits)
         recall.append(tp / n_gt)
         precision.append(tp / (tp + fp))
     recall.append(1.0)
@@ -225,14 +239,61 @@ def test_score_threshold_and_nms_of_each_protocol():
     assert len(filter_detections(shifted, PROTOCOLS["sparsealign"])) == 1
 
 
-def test_ties_keep_frame_and_row_order():
-    """Equal scores everywhere: order is (scenario, index, row), so AP is that of T F | F T."""
-    frames = [
-        FrameResult("a", 1, cars((50, 0, 0.5), (0, 0, 0.5)), cars((0, 0, 1))),
-        FrameResult("a", 0, cars((0, 0, 0.5), (50, 0, 0.5)), cars((0, 0, 1))),
+def tied_frames():
+    """Equal scores everywhere: a miss before a hit in frame 0, a hit before a miss in frame 1."""
+    return [
+        FrameResult("a", 0, cars((50, 0, 0.5), (0, 0, 0.5)), cars((0, 0, 1))),
+        FrameResult("a", 1, cars((0, 0, 0.5), (50, 0, 0.5)), cars((0, 0, 1))),
     ]
-    got = average_precision(frames, 0.5, GLOBAL_SORT)
-    assert got.ap_global == got.ap_legacy == pytest.approx(0.5 + 0.5 * 0.5)
+
+
+def test_equal_scores_are_one_step():
+    """All four detections at once: recall 1 at precision 1/2; frame by frame the same."""
+    got = average_precision(tied_frames(), 0.5, GLOBAL_SORT)
+    assert got.ap_global == got.ap_legacy == 0.5
+
+
+def test_ties_of_dair_put_the_hits_of_a_frame_first():
+    """H M | H M: precision 1 1/2 2/3 1/2; the first segment is dropped, so that 1/2 of recall at 2/3 is left."""
+    dair = replace(NO_NMS, ties="hits_first", matching="truth_first")
+    assert average_precision(tied_frames(), 0.5, dair).ap_global == pytest.approx(0.5 + 0.5 * 2 / 3)
+    dropped = replace(dair, drop_first_segment=True)
+    assert average_precision(tied_frames(), 0.5, dropped).ap_global == pytest.approx(0.5 * 2 / 3)
+
+
+def test_ties_of_opencood_follow_numpy():
+    """M H | H M, since numpy sorts few equal numbers stably: precision 0 1/2 2/3 1/2, made monotone 2/3 2/3 2/3 1/2."""
+    assert np.argsort(np.full(4, -0.5)).tolist() == [0, 1, 2, 3]
+    assert average_precision(tied_frames(), 0.5, replace(NO_NMS, ties="numpy")).ap_global == pytest.approx(2 / 3)
+    many = replace(cars(*[(3 * k, 0, 0.5) for k in range(40)], size=(2.0, 2.0, 1.5)), id=torch.arange(40))
+    got = filter_detections(many, replace(NO_NMS, ties="numpy"))
+    assert got.id.tolist() == np.argsort(np.full(40, -0.5, dtype=np.float32)).tolist()
+
+
+def test_the_order_of_ties_changes_nothing():
+    """Coarse scores, rows of detections shuffled in every frame: the same AP to the bit, also where they compete for a box."""
+    frames = [
+        replace(f, detections=replace(f.detections, score=(4 * f.detections.score).round() / 4))
+        for f in random_frames(6)
+    ]
+    frames.append(FrameResult("s9", 0, cars((0.4, 0, 0.5), (-0.4, 0, 0.5), (1, 0, 0.5)), cars((0, 0, 1), (1, 0, 1))))
+    g = torch.Generator().manual_seed(1)
+    shuffled = [replace(f, detections=f.detections[torch.randperm(len(f.detections), generator=g)]) for f in frames]
+    assert any(not torch.equal(a.detections.center, b.detections.center) for a, b in zip(frames, shuffled))
+    for protocol in (GLOBAL_SORT, NO_NMS, replace(NO_NMS, matching="best")):
+        for iou in (0.5, 0.7):
+            one, other = (average_precision(each, iou, protocol) for each in (frames, shuffled))
+            assert (one.ap_global, one.ap_legacy, one.precision) == (other.ap_global, other.ap_legacy, other.precision)
+
+
+def test_of_equal_scores_the_best_pair_is_matched_first():
+    """Both of score 0.5; the one that lies exactly takes the box, whatever its row, and the other falls back to the second box."""
+    truth = cars((0, 0, 1), (1, 0, 1))
+    for rows in (((0.4, 0, 0.5), (0, 0, 0.5)), ((0, 0, 0.5), (0.4, 0, 0.5))):
+        frame = compute_frame_iou(FrameResult("a", 0, cars(*rows), truth), NO_NMS)
+        match = match_frame(frame, 0.7, NO_NMS)
+        by_overlap = dict(zip(frame.iou[:, 0].round(decimals=3).tolist(), match.truth_row.tolist()))
+        assert by_overlap == {1.0: 0, 0.818: 1}
 
 
 def test_unknown_protocol_lists_the_known():
@@ -341,9 +402,41 @@ def test_boxes_of_other_classes_are_neither_truth_nor_detections():
     both = cars((0, 0, 0.9), (20, 0, 0.8), (10, 0, 0.7))
     both = replace(both, label=torch.tensor([0, 3, LABELS.index("pedestrian")]))
     frame = FrameResult("s", 0, both, both)
-    for protocol, count in ((GLOBAL_SORT, 2), (pedestrians, 1), (replace(GLOBAL_SORT, classes=CLASSES), 3)):
+    for protocol, count in ((GLOBAL_SORT, 2), (pedestrians, 1)):
         result = average_precision([frame], 0.5, protocol)
         assert (result.n_gt, result.n_detections, result.ap) == (count, count, 1.0)
+
+
+def test_classes_are_never_matched_with_each_other():
+    """A pedestrian is found as a car at the same place, and a car stands where a pedestrian was found: nothing matches."""
+    pedestrian = LABELS.index("pedestrian")
+    truth = replace(cars((0, 0, 1), (20, 0, 1)), label=torch.tensor([0, pedestrian]))
+    found = replace(truth, label=torch.tensor([pedestrian, 0]), score=torch.tensor([0.9, 0.8]).double())
+    frames = compute_frame_ious(FrameResult("s", 0, found, truth), GLOBAL_SORT.with_classes(CLASSES))
+    assert [f.class_name for f in frames] == list(CLASSES)
+    assert [tuple(f.iou.shape) for f in frames] == [(1, 1), (1, 1), (0, 0)]
+    matches = [match_frame(f, 0.5, GLOBAL_SORT.with_classes((f.class_name,))) for f in frames]
+    assert [m.tp.tolist() for m in matches] == [[False], [False], []]
+    assert [compute_ap([m], GLOBAL_SORT).ap for m in matches[:2]] == [0.0, 0.0]
+    with pytest.raises(ConfigError, match="of one class; the frames are of pedestrian, vehicle"):
+        compute_ap(matches[:2], GLOBAL_SORT)
+    with pytest.raises(ConfigError, match="of one class; protocol global-sort has vehicle, pedestrian, cyclist"):
+        compute_frame_iou(FrameResult("s", 0, found, truth), GLOBAL_SORT.with_classes(CLASSES))
+
+
+def test_no_class_suppresses_another():
+    """A pedestrian beside a car within its box: both stay, in whatever order."""
+    both = replace(cars((0, 0, 0.9), (0.5, 0, 0.8)), label=torch.tensor([0, LABELS.index("pedestrian")]))
+    frames = compute_frame_ious(FrameResult("s", 0, both, both), GLOBAL_SORT.with_classes(CLASSES))
+    assert [len(f.score) for f in frames] == [1, 1, 0]
+
+
+def test_all_vehicles_are_one_class_also_for_dair():
+    kinds = replace(cars(*((20 * k, 0, 0.9) for k in range(4))), label=torch.arange(4))
+    assert [LABELS[k] for k in range(4)] == ["car", "van", "truck", "bus"]
+    shown_as_cars = replace(kinds, label=torch.zeros(4, dtype=torch.int64))
+    for name in ("dair", "dair-3d"):
+        assert match_frame(FrameResult("s", 0, shown_as_cars, kinds), 0.5, PROTOCOLS[name]).tp.tolist() == [True] * 4
 
 
 def test_a_snapshot_without_truth_is_refused():
@@ -364,3 +457,48 @@ def test_ranges_on_dair_differ_where_their_sources_do() -> None:
     assert ranges["costr-dair"][0] == 0.0
     assert PROTOCOLS["sparsealign-dair"].com_range_m == 200.0
     assert PROTOCOLS["sparsealign-dair"].min_points_in_gt == PROTOCOLS["sparsealign"].min_points_in_gt == 4
+
+
+def test_any_corner_within_the_range_in_space_keeps_a_box():
+    """Range of dair: x 0 to 100, y ±39.68 m, and in z from -1.1 to 2.9 m above the road, since its origin is 1.9 m high."""
+    dair = PROTOCOLS["dair"]
+    for at, z, kept in (
+        ((-1.9, 0), 0.75, True),  # its front is at 0.1
+        ((-2.1, 0), 0.75, False),
+        ((101.9, 41.5), 0.75, False),  # a corner within x, another within y, none within both
+        ((101.9, 40.6), 0.75, True),
+        ((50, 0), 3.6, True),  # its underside is at 2.85
+        ((50, 0), 3.7, False),
+    ):
+        box = cars((*at, 0.9), z=z)
+        assert len(filter_detections(box, dair)) == kept, at
+        assert compute_frame_iou(FrameResult("a", 0, box, box), dair).iou.shape == (kept, kept), at
+        by_center = replace(dair, gt_range_mode="center", pred_range_mode="center")
+        assert len(filter_detections(box, by_center)) <= kept
+
+
+def test_an_overlap_on_the_ground_may_be_none_in_space():
+    """The same rectangle 0.75 m higher, half of its height: 1 on the ground, 1/3 in space."""
+    low, high = cars((20, 0, 0.9)), cars((20, 0, 1), z=1.5)
+    frame = FrameResult("a", 0, low, high)
+    for name, iou in (("dair", 1.0), ("dair-3d", 1 / 3)):
+        assert compute_frame_iou(frame, PROTOCOLS[name]).iou.item() == pytest.approx(iou)
+    assert average_precision([frame], 0.3, replace(PROTOCOLS["dair-3d"], drop_first_segment=False)).ap == 1.0
+    assert average_precision([frame], 0.5, PROTOCOLS["dair-3d"]).ap == 0.0
+
+
+def test_truth_lies_in_the_range_around_an_agent_that_lists_it():
+    """Box 3 is listed by agent 12, from 10 m; box 2 by agents 11 and 12, from 20 m and 40 m; the others from 20 m too."""
+    wide = replace(GLOBAL_SORT, com_range_m=100.0)
+    for reach, ids in ((50.0, [11, 12, 1, 2, 3]), (21.0, [11, 12, 1, 2, 3]), (15.0, [3]), (5.0, [])):
+        ranged = replace(wide, agent_range=(-reach, -reach, -3.0, reach, reach, 1.0))
+        assert select_ego_truth(crossing(), 0, ranged).id.tolist() == ids
+
+
+def test_opv2v_protocols_of_coalign_and_heal_differ_by_their_range_alone():
+    coalign, heal = PROTOCOLS["coalign-opv2v"], PROTOCOLS["heal-opv2v"]
+    assert (coalign.agent_range, heal.agent_range) == (coalign.gt_range, heal.gt_range)
+    assert replace(heal, name="", gt_range=coalign.gt_range, agent_range=None) == replace(
+        coalign, name="", agent_range=None
+    )
+    assert coalign.ap_order == "global" and coalign.score_threshold == 0.2 and heal.gt_range[3:5] == (102.4, 102.4)

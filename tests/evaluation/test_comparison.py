@@ -2,16 +2,20 @@
 """Hand-made steps, counted, and differences of hand-made results."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from manyeyes.agents.agent import Perception
 from manyeyes.agents.replay import ReplayStep, SentPackets
-from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
+from manyeyes.datatypes import CLASSES, LABELS, AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.evaluation.detection.accumulator import MethodResult, MetricAccumulator
 from manyeyes.evaluation.detection.average_precision import PROTOCOLS
 from manyeyes.evaluation.statistics.comparison import compare_methods
+from manyeyes.evaluation.statistics.operating_point import OperatingThreshold
+from manyeyes.viz.operating_table import format_operating_lines, format_operating_note, make_operating_rows
+from manyeyes.viz.table import HEADINGS, format_lines, make_row
 
 PROTOCOL = PROTOCOLS["global-sort"]
 SPOTS = ((10.0, 3.0), (20.0, -3.0), (30.0, 3.0), (40.0, -3.0))
@@ -49,7 +53,7 @@ def accumulate(method: str, found: list[int], sent_bytes: int = 1000) -> MethodR
     for number, hits in enumerate(found):
         for index in range(2):
             tally.add(step(method, f"s{number}", index, hits, sent_bytes))
-    return tally.compute_result()
+    return tally.compute_results()[0]
 
 
 def test_ap_bytes_age_and_times_are_those_of_the_steps() -> None:
@@ -78,3 +82,55 @@ def test_a_method_is_compared_with_every_other_at_both_thresholds() -> None:
 def test_without_the_method_there_is_nothing_to_compare() -> None:
     assert compare_methods([accumulate("none", [1]), accumulate("late", [2])], PROTOCOL) == ()
     assert compare_methods([accumulate("intermediate", [1])], PROTOCOL) == ()
+
+
+def test_classes_are_results_of_their_own_and_compared_within_themselves() -> None:
+    """The first two of four objects are pedestrians; "late" finds one object, "intermediate" three."""
+    protocol = PROTOCOL.with_classes(CLASSES[:2])
+    results = []
+    for method, found in (("late", 1), ("intermediate", 3)):
+        tally = MetricAccumulator(method, protocol)
+        for index in range(2):
+            tally.add(with_pedestrians(step(method, "s0", index, found, 1000)))
+        results += tally.compute_results({"pedestrian": OperatingThreshold(0.85, "weights")})
+    assert [(r.method, r.class_name, r.ap[0].n_gt, r.ap[0].ap) for r in results] == [
+        ("late", "vehicle", 4, 0.0),
+        ("late", "pedestrian", 4, 0.5),
+        ("intermediate", "vehicle", 4, 0.5),
+        ("intermediate", "pedestrian", 4, 1.0),
+    ]
+    assert {r.communication.num_ego_frames for r in results} == {2}
+    points = [r.operating_point for r in results]
+    assert [p.threshold.source for p in points if p] == ["default", "weights"] * 2
+    assert [p.recall.value for p in points if p] == [0.0, 0.5, 0.5, 0.5]
+    differences = compare_methods(results, protocol)
+    assert [(d.description, d.metric, d.interval.value) for d in differences if d.metric == "AP@0.5"] == [
+        ("intermediate - late, vehicle", "AP@0.5", 0.5),
+        ("intermediate - late, pedestrian", "AP@0.5", 0.5),
+    ]
+    names, *lines = format_lines([make_row(r) for r in results])
+    assert names[:2] == ("method", "class") and [line[1] for line in lines] == [r.class_name for r in results]
+    assert format_operating_lines(make_operating_rows(results))[0][:3] == ("method", "class", "threshold")
+
+
+def with_pedestrians(step: ReplayStep) -> ReplayStep:
+    """The same step, its first two objects and boxes pedestrians."""
+    truth = step.snapshot.truth
+    assert truth is not None
+
+    def relabel(boxes: Boxes) -> Boxes:
+        return replace(boxes, label=torch.where(torch.arange(len(boxes)) < 2, LABELS.index("pedestrian"), 0))
+
+    snapshot = replace(step.snapshot, truth=replace(truth, boxes=relabel(truth.boxes)))
+    return replace(step, snapshot=snapshot, perception=Perception(relabel(step.boxes), ()))
+
+
+def test_one_class_has_no_column() -> None:
+    results = [accumulate("late", [2, 4])]
+    assert format_lines([make_row(results[0])])[0] == HEADINGS
+    rows = make_operating_rows(results)
+    assert format_operating_lines(rows)[0][:2] == ("method", "threshold")
+    assert format_operating_lines(rows)[1][:4] == ("late", "0.400", "1.000 [1.000, 1.000]", "0.750 [0.500, 1.000]")
+    assert "chosen for no method" in format_operating_note(rows, 0.05) and "above 0.05" in format_operating_note(
+        rows, 0.05
+    )

@@ -4,8 +4,8 @@ import math
 import pytest
 import torch
 
-from manyeyes.datatypes import ShapeError
-from manyeyes.ops.box_iou import aligned_iou, pairwise_iou
+from manyeyes.datatypes import Boxes, ShapeError
+from manyeyes.ops.box_iou import aligned_iou, pairwise_iou, pairwise_iou_3d
 
 
 def corners(box):
@@ -137,3 +137,64 @@ def test_an_iou_loss_pulls_a_box_onto_its_target():
         (1 - aligned_iou(guess, target)).sum().backward()
         optimiser.step()
     assert aligned_iou(guess, target).item() > 0.95
+
+
+def upright(rows):
+    """Boxes from rows x, y, z, length, width, height, yaw."""
+    t = torch.tensor(rows, dtype=torch.float64).reshape(-1, 7)
+    return Boxes.of(t[:, :3], t[:, 3:6], t[:, 6])
+
+
+def clip_iou_3d(a, b):
+    """The slow twin: the clipped area times the shared height, and volumes."""
+    flat_a, flat_b = ([r[0], r[1], r[3], r[4], r[6]] for r in (a, b))
+    flat = clip_iou(flat_a, flat_b)
+    area = flat / (1 + flat) * (a[3] * a[4] + b[3] * b[4])
+    height = max(0.0, min(a[2] + a[5] / 2, b[2] + b[5] / 2) - max(a[2] - a[5] / 2, b[2] - b[5] / 2))
+    shared = area * height
+    return shared / (a[3] * a[4] * a[5] + b[3] * b[4] * b[5] - shared)
+
+
+def random_upright(n, seed):
+    g = torch.Generator().manual_seed(seed)
+    scale = torch.tensor([5, 5, 1.5, 6, 3, 2, 7.0]).double()
+    return (
+        torch.rand(n, 7, generator=g, dtype=torch.float64) * scale + torch.tensor([0, 0, 0, 0.5, 0.5, 0.5, 0])
+    ).tolist()
+
+
+def test_volumes_agree_with_their_slow_twin():
+    a, b = random_upright(20, 3), random_upright(25, 4)
+    got = pairwise_iou_3d(upright(a), upright(b))
+    expected = torch.tensor([[clip_iou_3d(p, q) for q in b] for p in a], dtype=torch.float64)
+    assert (expected > 0.1).sum() > 50
+    torch.testing.assert_close(got, expected, atol=1e-9, rtol=0)
+    torch.testing.assert_close(pairwise_iou_3d(upright(b), upright(a)).T, got, atol=1e-12, rtol=0)
+
+
+def test_volumes_by_hand():
+    """The same rectangle half as high over half of the height: 1/3. Above each other: 0. Equal boxes: 1."""
+    car = [0, 0, 1, 4, 2, 2, 0.3]
+    others = [
+        [0, 0, 2, 4, 2, 2, 0.3],
+        [0, 0, 3.1, 4, 2, 2, 0.3],
+        car,
+        [0, 0, 0.5, 4, 2, 1, 0.3 + math.pi],
+        [9, 9, 1, 4, 2, 2, 0],
+    ]
+    got = pairwise_iou_3d(upright([car]), upright(others))
+    assert got[0].tolist() == pytest.approx([1 / 3, 0, 1, 1 / 2, 0], abs=1e-9)
+
+
+def test_volumes_do_not_depend_on_where_the_boxes_stand():
+    a, b = random_upright(8, 5), random_upright(8, 6)
+    moved = [[[r[0] + 3000, r[1] - 500, r[2] + 7, *r[3:]] for r in rows] for rows in (a, b)]
+    torch.testing.assert_close(
+        pairwise_iou_3d(*map(upright, moved)), pairwise_iou_3d(upright(a), upright(b)), atol=1e-9, rtol=0
+    )
+
+
+def test_boxes_without_volume_share_none():
+    flat = upright([[0, 0, 1, 4, 2, 0, 0], [0, 0, 1, 0, 2, 2, 0], [0, 0, math.nan, 4, 2, 2, 0]])
+    assert pairwise_iou_3d(flat, upright([[0, 0, 1, 4, 2, 2, 0]])).tolist() == [[0], [0], [0]]
+    assert pairwise_iou_3d(flat[:0], flat).shape == (0, 3)

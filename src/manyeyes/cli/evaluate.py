@@ -16,7 +16,6 @@ from manyeyes.studies.replay_options import display_name, make_excerpt
 if TYPE_CHECKING:
     from manyeyes.agents.replay import ReplayConfig
     from manyeyes.datasets.base import Recording
-    from manyeyes.evaluation.detection.accumulator import MethodResult
     from manyeyes.models.detector.protocols import BoxDetector
 
 
@@ -32,6 +31,10 @@ class Options(EvaluationOptions):
     """Standard deviation of the heading noise of other agents, degrees."""
     all_egos: bool = False
     """Evaluate every agent as ego, not only the first."""
+    thresholds: Path | None = None
+    """results.json of 'manyeyes evaluate' on a validation split, whose thresholds of greatest F give precision and recall; by
+    default those of the card of the weights.
+    """
     timing_frames: NonNegativeInt = 10
     """Frames of the first scenario on which each method is timed by itself; 0 leaves times out."""
 
@@ -49,13 +52,19 @@ def _evaluate(options: Options) -> None:
 
     from manyeyes._io import atomic_write_text
     from manyeyes.datasets.registry import open_recording
-    from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, load_detector, resolve_protocol, run_benchmark
+    from manyeyes.evaluation.detection.benchmark import (
+        BenchmarkConfig,
+        check_class,
+        load_detector,
+        resolve_protocol,
+        run_benchmark,
+    )
     from manyeyes.studies import provenance
     from manyeyes.studies.recordings import adapt_to_dataset, check_evaluated_frames, check_files
     from manyeyes.studies.sensor_notes import print_sensor_note
+    from manyeyes.studies.thresholds import load_thresholds
     from manyeyes.viz.progress import track
-    from manyeyes.viz.results import print_comparison, summarize_comparison
-    from manyeyes.viz.table import DIFFERENCE_HEADINGS, format_difference_cells, format_markdown, format_markdown_lines
+    from manyeyes.viz.results import format_comparison_markdown, print_comparison, summarize_comparison
 
     console = Console()
     errors, sigma_yaw_rad = options.pose_errors, math.radians(options.noise_yaw_deg)
@@ -70,6 +79,8 @@ def _evaluate(options: Options) -> None:
         frame_stride=options.frame_stride,
     )
     protocol, detector = resolve_protocol(config), load_detector(config.weights)
+    check_class(options.object_class, protocol.classes)
+    thresholds = load_thresholds(options.thresholds, options.data, options.split) if options.thresholds else None
     opener = partial(open_recording, options.data, options.split)
     recording = opener()
     check_evaluated_frames(recording, recording.scenarios)
@@ -77,8 +88,13 @@ def _evaluate(options: Options) -> None:
     missing = check_files(recording, options.checks, console)
     print_sensor_note(recording, recording.scenarios[0], detector, console)
     with track(console, "Evaluating", len(recording.scenarios)) as report:
-        results = run_benchmark(opener, config, options.workers, report)
-    timed_results = [_measure_times(r, recording, detector, config.replay, options.timing_frames) for r in results]
+        results = run_benchmark(opener, config, options.workers, report, thresholds)
+    results = [r for r in results if options.object_class in (None, r.class_name)]
+    times = {
+        name: _measure_times(name, recording, detector, config.replay, options.timing_frames)
+        for name in dict.fromkeys(result.method for result in results)
+    }
+    timed_results = [replace(r, share_ms=times[r.method][0], perceive_ms=times[r.method][1]) for r in results]
     comparison = summarize_comparison(timed_results, protocol, missing)
     data_name = f"{options.data.name}{f'/{options.split}' if options.split else ''}"
     title = f"{display_name(options.replay_options.weights)} on {data_name}: {len(recording.scenarios)} scenarios, {protocol.name}"
@@ -89,15 +105,9 @@ def _evaluate(options: Options) -> None:
     provenance.write_json(
         options.out / "results.json", comparison, {"options": options, "benchmark": config}, options.seed
     )
-    text = f"{title}\n\n{format_markdown(comparison.rows)}"
-    if comparison.differences:
-        text += "\n" + format_markdown_lines(
-            [DIFFERENCE_HEADINGS, *map(format_difference_cells, comparison.differences)]
-        )
+    text = f"{title}\n\n{format_comparison_markdown(comparison)}"
     if note:
         text += f"\n{note}\n"
-    if comparison.footer:
-        text += f"\n{comparison.footer}\n"
     atomic_write_text(options.out / "results.md", text)
     console.print(
         f"\nNumbers, configuration and versions are in {options.out / 'results.json'}", highlight=False, soft_wrap=True
@@ -105,18 +115,20 @@ def _evaluate(options: Options) -> None:
 
 
 def _measure_times(
-    result: MethodResult, recording: Recording, detector: BoxDetector, config: ReplayConfig, num_frames: int
-) -> MethodResult:
-    """Measure times of one method by itself: in an evaluation, methods share the processing of each cloud."""
+    method: str, recording: Recording, detector: BoxDetector, config: ReplayConfig, num_frames: int
+) -> tuple[float, float]:
+    """Measure the time of share and perceive, ms, of one method by itself: in an evaluation, methods share the processing of each
+    cloud. NaN without frames.
+    """
     from manyeyes.agents.replay import replay
 
     if num_frames == 0:
-        return replace(result, share_ms=math.nan, perceive_ms=math.nan)
+        return math.nan, math.nan
     part = make_excerpt(recording, None, num_frames)
-    steps = list(replay(part, part.scenario, detector, [result.method], config))
+    steps = list(replay(part, part.scenario, detector, [method], config))
     share_s = [s.seconds for step in steps[1:] for s in step.sent if s.num_packets]
     perceive_s = [step.perceive_seconds for step in steps[1:]]
-    return replace(result, share_ms=_mean_ms(share_s), perceive_ms=_mean_ms(perceive_s))
+    return _mean_ms(share_s), _mean_ms(perceive_s)
 
 
 def _mean_ms(seconds: list[float]) -> float:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from manyeyes.datasets.base import Recording
+    from manyeyes.evaluation.detection.accumulator import MethodResult
     from manyeyes.evaluation.detection.benchmark import BenchmarkResult
     from manyeyes.training.detector.plan import TrainPlan
     from manyeyes.training.devices import Execution
@@ -160,14 +161,21 @@ def _write_results(
     before, after = results
     named = [(name, r) for name, result in (("before", before), ("after", after)) for r in result.methods]
     lines = tuple(
-        (name, r.method, *map(format_interval, r.intervals), format_number(r.communication.bytes_per_message))
+        (
+            name,
+            f"{r.method}{_name_class(r, after)}",
+            *map(format_interval, r.intervals),
+            format_number(r.communication.bytes_per_message),
+        )
         for name, r in named
     )
     comparisons = tuple(
         Comparison(
-            f"{new.method}, after - before", f"AP@{iou}", new.paired_difference(before[new.method], row, after.protocol)
+            f"{new.method}{_name_class(new, after)}, after - before",
+            f"AP@{iou}",
+            new.paired_difference(old, row, after.protocol),
         )
-        for new in after.methods
+        for old, new in zip(before.methods, after.methods, strict=True)
         for row, iou in enumerate((0.5, 0.7))
     )
     table = StudyTable("Holdout", ("weights", "method", "AP@0.5", "AP@0.7", "bytes/message"), lines)
@@ -175,8 +183,20 @@ def _write_results(
     console.print(make_terminal_table(make_comparison_table(comparisons)))
     console.print(f"{cpu_minutes:.1f} minutes of CPU time for this run", highlight=False)
     rows = [
-        {"weights": name, "method": r.method, "ap": r.intervals, "bytes_per_message": r.communication.bytes_per_message}
+        {
+            "weights": name,
+            "method": r.method,
+            "class_name": r.class_name,
+            "ap": r.intervals,
+            "bytes_per_message": r.communication.bytes_per_message,
+        }
         for name, r in named
     ]
     payload = {"rows": rows, "comparisons": comparisons, "cpu_minutes": cpu_minutes}
     provenance.write_json(options.out / "finetune.json", payload, {"options": options, "plan": plan}, options.seed)
+
+
+def _name_class(result: MethodResult, all_results: BenchmarkResult) -> str:
+    """Return what names the class of a result; empty where there is one class."""
+    has_classes = len({other.class_name for other in all_results.methods}) > 1
+    return f", {result.class_name}" if has_classes else ""

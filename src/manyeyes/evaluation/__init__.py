@@ -11,15 +11,17 @@ if TYPE_CHECKING:
     from manyeyes.evaluation.detection.accumulator import MethodResult as MethodResult
     from manyeyes.evaluation.detection.average_precision import (
         ApResult as ApResult,
-        DetectionProtocol as DetectionProtocol,
         average_precision as average_precision,
-        get_protocol as get_protocol,
     )
     from manyeyes.evaluation.detection.benchmark import (
         BenchmarkConfig as BenchmarkConfig,
         BenchmarkResult as BenchmarkResult,
         benchmark as benchmark,
         run_benchmark as run_benchmark,
+    )
+    from manyeyes.evaluation.detection.protocols import (
+        DetectionProtocol as DetectionProtocol,
+        get_protocol as get_protocol,
     )
     from manyeyes.evaluation.maps.matching import (
         MatchingProtocol as MatchingProtocol,

@@ -134,6 +134,11 @@ def default_drawing_score(detector: object, form: ScoreForm) -> float:
     return DEFAULT_DRAWING_SCORE if score_map is None else score_map.min_drawn
 
 
+def has_score_map(detector: object, form: ScoreForm) -> bool:
+    """Return whether the scores of a form are calibrated."""
+    return _find_map(detector, form) is not None
+
+
 def _find_map(detector: object, form: ScoreForm) -> ScoreMap | None:
     calibration = getattr(detector, "score_calibration", None)
     return calibration.get(form) if isinstance(calibration, ScoreCalibration) else None

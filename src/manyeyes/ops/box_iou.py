@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Intersection over union of oriented rectangles on the ground, vectorised and differentiable.
+"""Intersection over union of oriented rectangles on the ground and of upright boxes, vectorised and differentiable.
 
 The corners of the intersection of two convex quadrilaterals are among 24 candidates: the 8 corners (those that lie in
 the other rectangle) and the 16 crossings of their edges. Sorted by angle about their mean they bound the intersection,
@@ -12,7 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from manyeyes.datatypes import ShapeError
+from manyeyes.datatypes import Boxes, ShapeError
 
 _CORNER_SIGNS = ((0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5))
 
@@ -39,6 +39,23 @@ def aligned_iou(a: Tensor, b: Tensor) -> Tensor:
         near = ((distance <= _radius(a) + _radius(b)) & _solid(a) & _solid(b)).nonzero(as_tuple=True)
     overlap = _iou(a[near], b[near])
     return overlap.new_zeros(a.shape[0]).index_put(near, overlap)
+
+
+def pairwise_iou_3d(a: Boxes, b: Boxes) -> Tensor:
+    """Return the IoU (N, M) of the volumes of boxes that stand upright in one frame; differentiable in both.
+
+    Zero where a box has no volume or is not finite: the area that two rectangles share times the height that they share is exact.
+    """
+    with torch.no_grad():
+        row, column = near_pairs(_check_boxes(a.bev()), _check_boxes(b.bev())).nonzero(as_tuple=True)
+    one, other = a[row], b[column]
+    top = torch.minimum(one.center[:, 2] + one.size[:, 2] / 2, other.center[:, 2] + other.size[:, 2] / 2)
+    bottom = torch.maximum(one.center[:, 2] - one.size[:, 2] / 2, other.center[:, 2] - other.size[:, 2] / 2)
+    shared = _intersection_area(one.bev(), other.bev()) * (top - bottom).clamp_min(0)
+    union = one.size.prod(1) + other.size.prod(1) - shared
+    solid = (union > 1e-9) & (one.size > 0).all(1) & (other.size > 0).all(1) & shared.isfinite()
+    overlap = torch.where(solid, shared / torch.where(solid, union, 1.0), 0.0)
+    return overlap.new_zeros(len(a), len(b)).index_put((row, column), overlap)
 
 
 def near_pairs(a: Tensor, b: Tensor) -> Tensor:

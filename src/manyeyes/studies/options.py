@@ -42,8 +42,11 @@ class EvaluationOptions(RecordingStudyOptions):
     """Options of what replays a recording with fusion methods."""
 
     protocol: str = "global-sort"
-    """Evaluation protocol: global-sort, opencood, coalign, sparsealign; on DAIR-V2X also dair, heal-dair, costr-dair,
-    sparsealign-dair."""
+    """Evaluation protocol: global-sort, opencood, coalign, sparsealign; on OPV2V also coalign-opv2v, heal-opv2v; on DAIR-V2X
+    dair, dair-3d, heal-dair, costr-dair, costr-dair-centred, sparsealign-dair.
+    """
+    object_class: Literal["vehicle", "pedestrian", "cyclist"] | None = None
+    """The class whose numbers are computed; by default all that the weights detect in 'evaluate', the first of them in a study."""
     workers: WorkerCount = os.cpu_count() or 1
     """How many processes share the scenarios; results do not depend on it."""
     replay_options: ReplayOptions = field(default_factory=ReplayOptions)

@@ -16,7 +16,8 @@ from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.datasets.missing import NONE_MISSING, MissingFiles
 from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.evaluation.detection.accumulator import MetricAccumulator
-from manyeyes.evaluation.detection.average_precision import DetectionProtocol, get_protocol
+from manyeyes.evaluation.detection.benchmark import find_thresholds, make_own_protocol
+from manyeyes.evaluation.detection.protocols import DetectionProtocol
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.protocols import BoxDetector
 from manyeyes.models.score_calibration import default_drawing_score
@@ -90,7 +91,7 @@ def replay_and_report(drive: Excerpt, detector: BoxDetector, spec: ReportSpec, c
     if pictured_index not in eval_indices:
         valid_range = f"{eval_indices.start} to {eval_indices[-1]}"
         raise ConfigError(f"Frame {pictured_index} of {drive.scenario} is not evaluated; choose one of {valid_range}.")
-    grid, protocol = detector.detection_range, make_protocol(detector)
+    grid, protocol = detector.detection_range, make_own_protocol(detector)
     min_scores = {name: find_min_score(detector, name, spec.min_score) for name in spec.methods}
     metrics = {name: MetricAccumulator(name, protocol) for name in spec.methods}
     film = _Film(_select_animated(spec.methods) if spec.animate else ())
@@ -107,7 +108,13 @@ def replay_and_report(drive: Excerpt, detector: BoxDetector, spec: ReportSpec, c
                 film.add(step.method, _draw_step(step, grid, _make_caption(step), min_scores[step.method], FILM_WIDTH))
             progress.advance(task)
     comparison = summarize_comparison(
-        [accumulator.compute_result() for accumulator in metrics.values()], protocol, spec.missing
+        [
+            result
+            for name, accumulator in metrics.items()
+            for result in accumulator.compute_results(find_thresholds(detector, name))
+        ],
+        protocol,
+        spec.missing,
     )
     print_comparison(console, comparison, spec.title)
     pose_chapters = _make_pose_chapters(pose_summaries)
@@ -151,14 +158,6 @@ def _make_pose_chapters(pose_summaries: Mapping[str, PoseCorrectionSummary]) -> 
         Chapter(f"Pose correction, {name}", text, table=(HEADINGS, *summary.make_rows()))
         for name, summary in pose_summaries.items()
         if summary.senders
-    )
-
-
-def make_protocol(detector: BoxDetector) -> DetectionProtocol:
-    """Return the project's own protocol over the range that the detector sees."""
-    grid = detector.detection_range
-    return get_protocol("global-sort").with_range(
-        (grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max)
     )
 
 
@@ -208,7 +207,7 @@ def _save_pictures(
     min_scores: Mapping[str, float],
 ) -> tuple[ReportImage, ...]:
     """Return one bird's-eye picture a method, of the same instant."""
-    rows = {row.method: row for row in comparison.rows}
+    rows = {row.method: row for row in reversed(comparison.rows)}
     out = []
     for step in steps:
         ap = rows[step.method].ap50

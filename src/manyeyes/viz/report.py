@@ -17,12 +17,11 @@ from manyeyes.evaluation.statistics.comparison import Comparison
 from manyeyes.viz.table import (
     DATA_AGE,
     DIFFERENCE_HEADINGS,
-    HEADINGS,
     LOG2_BYTES,
     NOT_RUN,
     MethodRow,
-    format_cells,
     format_difference_cells,
+    format_lines,
 )
 
 MIME = {".png": "image/png", ".gif": "image/gif", ".webp": "image/webp", ".svg": "image/svg+xml"}
@@ -113,7 +112,7 @@ def render(report: HtmlReport) -> str:
         columns = "".join(f"<dt>{_escape(name)}</dt><dd>{_escape(what)}</dd>" for name, what in COLUMN_DESCRIPTIONS)
         parts += [
             "<h2>Results</h2>",
-            _table(HEADINGS, [format_cells(row) for row in report.rows]),
+            _table(*_split_headings(format_lines(report.rows))),
             f"<details><summary>Definitions of columns</summary><dl>{columns}</dl></details>",
         ]
     if report.differences:
@@ -155,6 +154,10 @@ def save_report(report: HtmlReport, path: Path) -> None:
 
 def _escape(value: str) -> str:
     return html.escape(value, quote=True)
+
+
+def _split_headings(lines: Sequence[tuple[str, ...]]) -> tuple[tuple[str, ...], Sequence[tuple[str, ...]]]:
+    return lines[0], lines[1:]
 
 
 def _table(headings: Sequence[str], lines: Sequence[Sequence[str]]) -> str:

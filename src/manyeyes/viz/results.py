@@ -10,21 +10,41 @@ from rich.console import Console
 
 from manyeyes.datasets.missing import NONE_MISSING, MissingFiles
 from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS, MethodResult
-from manyeyes.evaluation.detection.average_precision import DetectionProtocol
 from manyeyes.evaluation.detection.communication import Communication
+from manyeyes.evaluation.detection.protocols import DetectionProtocol
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.evaluation.statistics.comparison import Comparison, compare_methods
-from manyeyes.viz.table import MethodRow, make_differences_table, make_row, make_terminal_table, missing_footer
+from manyeyes.evaluation.statistics.operating_point import OperatingPoint
+from manyeyes.viz.operating_table import (
+    OperatingRow,
+    format_operating_markdown,
+    format_operating_note,
+    make_operating_rows,
+    make_operating_table,
+)
+from manyeyes.viz.table import (
+    DIFFERENCE_HEADINGS,
+    MethodRow,
+    format_difference_cells,
+    format_markdown,
+    format_markdown_lines,
+    make_differences_table,
+    make_row,
+    make_terminal_table,
+    missing_footer,
+)
 
 
 @dataclass(frozen=True)
 class ApSummary:
-    """AP at one IoU threshold. ap: by the protocol; recall, precision: at its score threshold."""
+    """AP at one IoU threshold. ap: by the protocol; ap_legacy: over concatenated frames; recall, precision: at its score
+    threshold.
+    """
 
     iou: float
     ap: Interval
     ap_global: float
-    ap_legacy: float
+    ap_legacy: Interval
     recall: float
     precision: float
     n_gt: int
@@ -33,25 +53,31 @@ class ApSummary:
 
 @dataclass(frozen=True)
 class MethodStats:
-    """Metrics of one method, without its frames."""
+    """Metrics of one method and class, without its frames. best_threshold: the score of greatest F on these data, for others."""
 
     method: str
+    class_name: str
     ap_summaries: tuple[ApSummary, ...]
     communication: Communication
     age_ms: float
     share_ms: float
     perceive_ms: float
+    operating_point: OperatingPoint | None
+    best_threshold: float | None
 
 
 @dataclass(frozen=True)
 class MethodComparison:
-    """Comparison of methods. protocol: rules and range of AP. missing: missing files of the recording."""
+    """Comparison of methods. protocol: rules and range of AP. missing: missing files of the recording. operating_rows: methods at
+    their score thresholds.
+    """
 
     protocol: DetectionProtocol
     stats: tuple[MethodStats, ...]
     rows: tuple[MethodRow, ...]
     differences: tuple[Comparison, ...]
     missing: MissingFiles = NONE_MISSING
+    operating_rows: tuple[OperatingRow, ...] = ()
 
     @property
     def footer(self) -> str:
@@ -68,24 +94,55 @@ def summarize_comparison(
     results: Sequence[MethodResult], protocol: DetectionProtocol, missing: MissingFiles = NONE_MISSING
 ) -> MethodComparison:
     """Summarize measured methods: rows, metrics and paired differences."""
-    stats = []
-    for result in results:
-        columns = zip(IOU_THRESHOLDS, result.intervals, result.ap)
-        ap_summaries = tuple(
-            ApSummary(iou, interval, ap.ap_global, ap.ap_legacy, ap.recall, ap.precision, ap.n_gt, ap.n_detections)
-            for iou, interval, ap in columns
-        )
-        sent = result.communication
-        stats.append(MethodStats(result.method, ap_summaries, sent, result.age_ms, result.share_ms, result.perceive_ms))
+    stats = tuple(map(_summarize_method, results))
     rows = tuple(make_row(result) for result in results)
-    return MethodComparison(protocol, tuple(stats), rows, compare_methods(results, protocol), missing)
+    differences = compare_methods(results, protocol)
+    return MethodComparison(protocol, stats, rows, differences, missing, make_operating_rows(results))
+
+
+def _summarize_method(result: MethodResult) -> MethodStats:
+    columns = zip(IOU_THRESHOLDS, result.intervals, result.legacy_intervals, result.ap)
+    ap_summaries = tuple(
+        ApSummary(iou, interval, ap.ap_global, legacy, ap.recall, ap.precision, ap.n_gt, ap.n_detections)
+        for iou, interval, legacy, ap in columns
+    )
+    return MethodStats(
+        result.method,
+        result.class_name,
+        ap_summaries,
+        result.communication,
+        result.age_ms,
+        result.share_ms,
+        result.perceive_ms,
+        result.operating_point,
+        result.best_threshold,
+    )
 
 
 def print_comparison(console: Console, comparison: MethodComparison, title: str) -> None:
     """Print the table of methods and the paired differences."""
     console.print(make_terminal_table(comparison.rows, title))
+    if comparison.operating_rows:
+        console.print()
+        console.print(make_operating_table(comparison.operating_rows))
+        note = format_operating_note(comparison.operating_rows, comparison.protocol.score_threshold)
+        console.print(note, highlight=False, soft_wrap=True)
     if comparison.footer:
         console.print(comparison.footer, highlight=False, soft_wrap=True)
     if comparison.has_several_scenarios and comparison.differences:
         console.print()
         console.print(make_differences_table(comparison.differences))
+
+
+def format_comparison_markdown(comparison: MethodComparison) -> str:
+    """Format the tables of methods, of their operating points and of paired differences."""
+    parts = [format_markdown(comparison.rows)]
+    if comparison.operating_rows:
+        parts.append(format_operating_markdown(comparison.operating_rows, comparison.protocol.score_threshold))
+    if comparison.differences:
+        parts.append(
+            format_markdown_lines([DIFFERENCE_HEADINGS, *map(format_difference_cells, comparison.differences)])
+        )
+    if comparison.footer:
+        parts.append(f"{comparison.footer}\n")
+    return "\n".join(parts)

@@ -12,6 +12,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from manyeyes.datatypes import VEHICLES
 from manyeyes.evaluation.detection.accumulator import MethodResult
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.evaluation.statistics.comparison import Comparison
@@ -38,6 +39,7 @@ class MethodRow:
     age_ms: float | None = None
     share_ms: float | None = None
     perceive_ms: float | None = None
+    class_name: str = VEHICLES[0]
 
     @property
     def log2_bytes(self) -> float | None:
@@ -55,6 +57,7 @@ def make_row(result: MethodResult) -> MethodRow:
         result.age_ms,
         result.share_ms,
         result.perceive_ms,
+        result.class_name,
     )
 
 
@@ -68,14 +71,28 @@ def format_cells(row: MethodRow) -> tuple[str, ...]:
     """Format a row in the order of HEADINGS."""
     return (
         row.method,
-        _format_interval(row.ap50),
-        _format_interval(row.ap70),
+        format_interval(row.ap50),
+        format_interval(row.ap70),
         _format_number(row.bytes_per_message, 0),
         "-" if row.bytes_per_message == 0 else _format_number(row.log2_bytes, 2),
         "-" if row.bytes_per_message == 0 else _format_number(row.age_ms, 0),
         "-" if row.bytes_per_message == 0 else _format_number(row.share_ms, 1),
         _format_number(row.perceive_ms, 1),
     )
+
+
+def format_lines(rows: Sequence[MethodRow]) -> list[tuple[str, ...]]:
+    """Format the headings and the rows of methods; a column of classes where there are several."""
+    return add_class_column([HEADINGS, *map(format_cells, rows)], [row.class_name for row in rows])
+
+
+def add_class_column(lines: Sequence[tuple[str, ...]], class_names: Sequence[str]) -> list[tuple[str, ...]]:
+    """Return lines, the first of them headings, with the class of each further one behind its first cell; unchanged where there is
+    one class.
+    """
+    if len(set(class_names)) < 2:
+        return list(lines)
+    return [(line[0], name, *line[1:]) for line, name in zip(lines, ("class", *class_names), strict=True)]
 
 
 def make_table(
@@ -137,13 +154,15 @@ def _max_length(texts: Sequence[str], separator: str | None) -> int:
 
 def make_terminal_table(rows: Sequence[MethodRow], title: str = "") -> RenderableType:
     """Create the table of methods for 80 columns: units and intervals are on a second line."""
-    headings = [heading.replace("/", "/\n").replace("(", "\n(").replace(" [", "\n[") for heading in HEADINGS]
-    return make_table(title, headings, [[_two_lines(cell) for cell in format_cells(row)] for row in rows])
+    names, *lines = format_lines(rows)
+    headings = [heading.replace("/", "/\n").replace("(", "\n(").replace(" [", "\n[") for heading in names]
+    num_left = 1 + len(names) - len(HEADINGS)
+    return make_table(title, headings, [[split_intervals(cell) for cell in line] for line in lines], num_left)
 
 
 def format_markdown(rows: Sequence[MethodRow]) -> str:
     """Format the table of methods as aligned Markdown."""
-    return format_markdown_lines([HEADINGS, *(format_cells(row) for row in rows)])
+    return format_markdown_lines(format_lines(rows))
 
 
 def missing_footer(count: int, listed_in: str = "results.json") -> str:
@@ -177,12 +196,14 @@ def format_markdown_lines(body: Sequence[Sequence[str]]) -> str:
     return "\n".join((text[0], rule, *text[1:])) + "\n"
 
 
-def _two_lines(cell: str) -> str:
+def split_intervals(cell: str) -> str:
+    """Return a cell with its interval on a second line."""
     value, bracket, interval = cell.partition(" [")
     return f"{value}\n{interval.rstrip(']').replace(', ', '-')}" if bracket else cell
 
 
-def _format_interval(value: Interval | None) -> str:
+def format_interval(value: Interval | None) -> str:
+    """Format a number with its interval."""
     if value is None:
         return NOT_RUN
     if math.isnan(value.value):

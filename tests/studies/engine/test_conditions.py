@@ -125,7 +125,13 @@ def make_result(method: str, hits: tuple[int, ...]) -> MethodMatches:
         frames.append(FrameMatch(f"s{number}", 0, torch.linspace(0.9, 0.5, found + 1).double(), rows, 4))
     speeds = tuple(torch.tensor([0.0, 0.0, 9.0, 9.0]) for _ in hits)
     return MethodMatches(
-        method, (tuple(frames), tuple(frames)), speeds, summarize_messages([], len(hits)), BusVolume(0, 0.0, 0), 0.0
+        method,
+        (tuple(frames), tuple(frames)),
+        speeds,
+        summarize_messages([], len(hits)),
+        BusVolume(0, 0.0, 0),
+        0.0,
+        len(hits),
     )
 
 

@@ -53,10 +53,16 @@ def make_result() -> MethodMatches:
     half = (frame("a", 6), frame("a", 7, ()), frame("b", 6, (-1, 1)))
     seven = (frame("a", 6, (2, -1, -1, -1)), frame("a", 7, ()), frame("b", 6, (-1, -1)))
     return MethodMatches(
-        "late", (half, seven), (SPEED, SPEED + 1, SPEED * 2), summarize_messages([], 3), BusVolume(0, 0.0, 0), math.nan
+        "late",
+        (half, seven),
+        (SPEED, SPEED + 1, SPEED * 2),
+        summarize_messages([], 3),
+        BusVolume(0, 0.0, 0),
+        math.nan,
+        3,
     )
 
 
 def test_scenarios_and_speeds_choose_frames() -> None:
-    assert [(m.scenario, m.index) for m in make_result().select_matches(0)] == [("a", 6), ("a", 7), ("b", 6)]
-    assert [(m.scenario, m.n_gt) for m in make_result().select_matches(1, {"b"}, FAST)] == [("b", 2)]
+    assert [(m.scenario, m.index) for m in make_result().select_matches(0, "vehicle")] == [("a", 6), ("a", 7), ("b", 6)]
+    assert [(m.scenario, m.n_gt) for m in make_result().select_matches(1, "vehicle", {"b"}, FAST)] == [("b", 2)]

@@ -4,34 +4,45 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from torch import Tensor
 
 from manyeyes.agents.replay import ReplayStep
+from manyeyes.datatypes import VEHICLES
 from manyeyes.evaluation.detection.average_precision import (
     ApResult,
-    DetectionProtocol,
-    FrameIou,
-    FrameMatch,
-    FrameResult,
     compute_ap,
-    compute_frame_iou,
+    compute_frame_ious,
     match_frame,
     select_ego_truth,
 )
 from manyeyes.evaluation.detection.communication import Communication, MessageRecord, summarize_messages
+from manyeyes.evaluation.detection.frame_match import FrameIou, FrameMatch, FrameResult
+from manyeyes.evaluation.detection.protocols import DetectionProtocol
 from manyeyes.evaluation.statistics.bootstrap import Interval, bootstrap
+from manyeyes.evaluation.statistics.operating_point import (
+    OperatingPoint,
+    OperatingThreshold,
+    compute_operating_point,
+    find_best_threshold,
+)
 from manyeyes.evaluation.statistics.reliability import Reliability, compute_reliability
+from manyeyes.models.score_calibration import DEFAULT_DRAWING_SCORE
 
 IOU_THRESHOLDS = (0.5, 0.7)
+DEFAULT_THRESHOLD = OperatingThreshold(DEFAULT_DRAWING_SCORE, "default")
 
 
 @dataclass(frozen=True)
 class MethodResult:
-    """One method over all scenarios. ap and intervals: one an IoU threshold, in the order of IOUS."""
+    """One method over all scenarios, its metrics of one class.
+
+    ap, intervals and legacy_intervals (of the AP over concatenated frames): one an IoU threshold, in the order of IOU_THRESHOLDS.
+    operating_point: at the first of them. best_threshold: the score of greatest F there, for an evaluation of other data.
+    """
 
     method: str
     ap: tuple[ApResult, ...]
@@ -40,9 +51,13 @@ class MethodResult:
     age_ms: float
     share_ms: float
     perceive_ms: float
+    class_name: str = VEHICLES[0]
+    legacy_intervals: tuple[Interval, ...] = ()
+    operating_point: OperatingPoint | None = None
+    best_threshold: float | None = None
 
     def paired_difference(self, other: MethodResult, iou: int, protocol: DetectionProtocol) -> Interval:
-        """Return the AP of this method minus that of another, paired over scenarios. iou: index into IOUS."""
+        """Return the AP of this method minus that of another, paired over scenarios. iou: index into IOU_THRESHOLDS."""
         samples = (bootstrap(result.ap[iou].frames, protocol=protocol) for result in (self, other))
         return next(samples).paired_difference(next(samples))
 
@@ -51,8 +66,8 @@ class MethodResult:
 class MetricAccumulator:
     """What one method did so far, in the little that judging needs: no cloud is kept.
 
-    speeds: (G,) m/s of each frame's true boxes. Messages are those that other agents sent for an ego's frame, arrived or not.
-    share_s counts calls that returned a message.
+    frames: of each class of the protocol, step by step. speeds: (G,) m/s of each frame's true boxes. Messages are those that other
+    agents sent for an ego's frame, arrived or not. share_s counts calls that returned a message.
     """
 
     method: str
@@ -69,8 +84,8 @@ class MetricAccumulator:
         snapshot, ego = step.snapshot, step.snapshot.frames[step.ego].agent_id
         truth = select_ego_truth(snapshot, step.ego, self.protocol)
         result = FrameResult(snapshot.scenario, snapshot.index, step.boxes, truth)
-        self.frames.append(compute_frame_iou(result, self.protocol))
-        self.speeds.append(truth.velocity.norm(dim=1))
+        self.frames += compute_frame_ious(result, self.protocol)
+        self.speeds += [truth.of_classes((name,)).velocity.norm(dim=1) for name in self.protocol.classes]
         received = (h.message for h in step.perception.received)
         arrived = {m.agent_id: tuple(m.tokens.features.shape) for m in received if m.tokens is not None}
         for sent in step.sent:
@@ -95,35 +110,63 @@ class MetricAccumulator:
         self.perceive_s += other.perceive_s
 
     def match_frames(self) -> tuple[tuple[FrameMatch, ...], ...]:
-        """Return the frames matched at each of IOUS, in the order they came in."""
-        return tuple(tuple(match_frame(frame, iou, self.protocol) for frame in self.frames) for iou in IOU_THRESHOLDS)
+        """Return the frames, of all classes, matched at each of IOU_THRESHOLDS, in the order they came in."""
+        return tuple(
+            tuple(match_frame(frame, iou, self._protocol_of(frame.class_name)) for frame in self.frames)
+            for iou in IOU_THRESHOLDS
+        )
 
-    def compute_reliability(self) -> Reliability:
-        """Return the reliability of the scores of evaluated boxes, correct at the first of IOUS."""
-        matches = [match_frame(frame, IOU_THRESHOLDS[0], self.protocol) for frame in self.frames]
+    def _protocol_of(self, class_name: str) -> DetectionProtocol:
+        return self.protocol.with_classes((class_name,))
+
+    def compute_reliability(self, class_name: str | None = None) -> Reliability:
+        """Return the reliability of the scores of evaluated boxes of a class, by default the first of the protocol, correct at the
+        first of IOU_THRESHOLDS.
+        """
+        protocol = self._protocol_of(class_name or self.protocol.classes[0])
+        frames = (frame for frame in self.frames if frame.class_name == protocol.class_name)
+        matches = [match_frame(frame, IOU_THRESHOLDS[0], protocol) for frame in frames]
         score = np.concatenate([match.score.numpy() for match in matches] or [np.zeros(0)])
         is_correct = np.concatenate([match.tp.numpy() for match in matches] or [np.zeros(0, dtype=bool)])
         return compute_reliability(score, is_correct)
 
     def summarize_communication(self) -> Communication:
         """Summarise what was sent, in bytes a message."""
-        return summarize_messages(self.messages, len(self.frames))
+        return summarize_messages(self.messages, len(self.frames) // len(self.protocol.classes))
 
     def mean_age_ms(self) -> float:
         """Return the mean age of what took part, when it was used; NaN where nothing did."""
         return _mean_ms(self.ages_s)
 
-    def compute_result(self) -> MethodResult:
-        """Return the numbers of everything counted so far."""
-        matches = self.match_frames()
+    def compute_results(self, thresholds: Mapping[str, OperatingThreshold] | None = None) -> tuple[MethodResult, ...]:
+        """Return the numbers of everything counted so far, of each class of the protocol.
+
+        thresholds: by class; DEFAULT_THRESHOLD of those that it lacks.
+        """
+        matched = self.match_frames()
+        return tuple(
+            self._compute_class(name, matched, (thresholds or {}).get(name, DEFAULT_THRESHOLD))
+            for name in self.protocol.classes
+        )
+
+    def _compute_class(
+        self, name: str, matched: Sequence[Sequence[FrameMatch]], threshold: OperatingThreshold
+    ) -> MethodResult:
+        protocol = self._protocol_of(name)
+        legacy = replace(protocol, ap_order="concatenated")
+        matches = [[match for match in column if match.class_name == name] for column in matched]
         return MethodResult(
             self.method,
-            tuple(compute_ap(m, self.protocol) for m in matches),
-            tuple(bootstrap(m, protocol=self.protocol).interval() for m in matches),
+            tuple(compute_ap(m, protocol) for m in matches),
+            tuple(bootstrap(m, protocol=protocol).interval() for m in matches),
             self.summarize_communication(),
             self.mean_age_ms(),
             _mean_ms(self.share_s),
             _mean_ms(self.perceive_s),
+            name,
+            tuple(bootstrap(m, protocol=legacy).interval() for m in matches),
+            compute_operating_point(matches[0], threshold, protocol),
+            find_best_threshold(matches[0], protocol),
         )
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import multiprocessing
 import pickle
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
@@ -16,17 +16,20 @@ from pathlib import Path
 import torch
 
 from manyeyes.agents.replay import WARMUP_FRAMES, CachedOutputs, ReplayConfig, ReplayStep, replay
+from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.datasets.base import Recording
 from manyeyes.datasets.odometry_drift import DriftingOdometry, OdometryDrift
 from manyeyes.datasets.perturbation import PoseNoise
-from manyeyes.datatypes import Snapshot
+from manyeyes.datatypes import VEHICLES, ConfigError, Snapshot
 from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS, MethodResult, MetricAccumulator
-from manyeyes.evaluation.detection.average_precision import DetectionProtocol, get_protocol
+from manyeyes.evaluation.detection.protocols import DetectionProtocol, get_protocol
 from manyeyes.evaluation.detection.recording_filters import CachedRecording, FrameStride, NearestAgents
 from manyeyes.evaluation.detection.sensor_change import NO_SENSOR_CHANGE, SensorChange
+from manyeyes.evaluation.statistics.operating_point import OperatingThreshold
 from manyeyes.models import pretrained
 from manyeyes.models.detector.protocols import BoxDetector, check_detector
 from manyeyes.models.detector.single_sweep import with_single_sweep
+from manyeyes.models.score_calibration import default_drawing_score, has_score_map
 
 CONDITIONS_PER_GROUP = 8
 """Conditions that are played side by side: more of them see each sweep once, fewer of them are lost when a study is stopped."""
@@ -62,11 +65,42 @@ class BenchmarkConfig:
 
 
 def resolve_protocol(config: BenchmarkConfig) -> DetectionProtocol:
-    """Return the named protocol; our own one uses the output range of the detector."""
-    protocol, grid = get_protocol(config.protocol), load_detector(config.weights).detection_range
-    if config.protocol != "global-sort":
-        return protocol
-    return protocol.with_range((grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max))
+    """Return the named protocol of the classes of the detector; our own one uses its output range too."""
+    detector = load_detector(config.weights)
+    if config.protocol == "global-sort":
+        return make_own_protocol(detector)
+    return get_protocol(config.protocol).with_classes(list_classes(detector))
+
+
+def make_own_protocol(detector: BoxDetector) -> DetectionProtocol:
+    """Return the project's own protocol over the range and of the classes of a detector."""
+    grid = detector.detection_range
+    return (
+        get_protocol("global-sort")
+        .with_range((grid.x_min, grid.y_min, grid.z_min, grid.x_max, grid.y_max, grid.z_max))
+        .with_classes(list_classes(detector))
+    )
+
+
+def list_classes(detector: BoxDetector) -> tuple[str, ...]:
+    """Return the classes of ``datatypes.CLASSES`` that a detector finds; vehicles where it does not say."""
+    return tuple(getattr(detector, "classes", None) or VEHICLES)
+
+
+def check_class(name: str | None, classes: Sequence[str]) -> None:
+    """Raise a ConfigError where a class is asked for that a detector does not find; None asks for none."""
+    if name is not None and name not in classes:
+        raise ConfigError(f"--object-class is one that the weights detect: {', '.join(classes)}; got {name}.")
+
+
+def find_thresholds(detector: BoxDetector, method: str) -> dict[str, OperatingThreshold]:
+    """Return the threshold of a method for each class of a detector: that of the card of its weights, if it is calibrated.
+
+    A card has one threshold for each form of result, and of all classes.
+    """
+    form = get_strategy(method).score_form
+    score, source = default_drawing_score(detector, form), "weights" if has_score_map(detector, form) else "default"
+    return {name: OperatingThreshold(score, source) for name in list_classes(detector)}
 
 
 def load_detector(weights: str | BoxDetector) -> BoxDetector:
@@ -191,28 +225,48 @@ def run_benchmark(
     config: BenchmarkConfig,
     workers: int = 1,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    thresholds: Mapping[str, Mapping[str, OperatingThreshold]] | None = None,
 ) -> tuple[MethodResult, ...]:
-    """Return every method on every scenario. open_recording must be picklable when workers > 1; results do not depend on
-    workers.
+    """Return every method on every scenario, of each class of the detector. open_recording must be picklable when workers > 1;
+    results do not depend on workers.
+
+    thresholds: of the operating point, by method and class; those of the weights where it lacks them.
     """
+    detector, chosen = load_detector(config.weights), thresholds or {}
     with closing(run_benchmarks(open_recording, [config], workers, progress)) as accumulators:
-        return tuple(accumulator.compute_result() for accumulator in next(accumulators))
+        return tuple(
+            result
+            for accumulator in next(accumulators)
+            for result in accumulator.compute_results(
+                {**find_thresholds(detector, accumulator.method), **chosen.get(accumulator.method, {})}
+            )
+        )
 
 
 @dataclass(frozen=True)
 class BenchmarkResult:
-    """Results of methods on a recording, in their order; ``result["late"]`` is one of them, and ``print(result)`` a table."""
+    """Results of methods on a recording, in their order, of each class of the detector.
+
+    ``result["late"]`` is one of them, of the first class, and ``print(result)`` a table.
+    """
 
     protocol: DetectionProtocol
     methods: tuple[MethodResult, ...]
 
     def __getitem__(self, method: str) -> MethodResult:
-        return {result.method: result for result in self.methods}[method]
+        return {result.method: result for result in reversed(self.methods)}[method]
 
     def __str__(self) -> str:
-        names = ("method", *(f"AP@{iou}" for iou in IOU_THRESHOLDS), "bytes/message")
+        has_classes = len({result.class_name for result in self.methods}) > 1
+        class_heading = ("class",) if has_classes else ()
+        names = ("method", *class_heading, *(f"AP@{iou}" for iou in IOU_THRESHOLDS), "bytes/message")
         rows = [
-            (result.method, *(f"{interval.value:.3f}" for interval in result.intervals), _format_bytes(result))
+            (
+                result.method,
+                *((result.class_name,) if has_classes else ()),
+                *(f"{interval.value:.3f}" for interval in result.intervals),
+                _format_bytes(result),
+            )
             for result in self.methods
         ]
         widths = [max(map(len, column)) for column in zip(names, *rows)]

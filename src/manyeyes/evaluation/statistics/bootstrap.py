@@ -7,9 +7,9 @@ this is a weight k on each of its rows, and one global sort serves all resamples
 no mean of per-scenario APs). Two methods are compared on the *same* resamples, which cancels how hard a scenario is.
 Resamples without any truth are left out. Source: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, ch. 13.
 
-Where two *different* detections tie exactly in score, and for a protocol that concatenates frames instead of sorting, a
-weight repeats each detection in its place, where writing the scenario out again would interleave the copies; that moves
-the running precision by less than the ties themselves do.
+A protocol that evaluates equal scores together is exact with weights. Where a protocol orders ties, or concatenates frames
+instead of sorting, a weight repeats each detection in its place, where writing the scenario out again would interleave the
+copies; that moves the running precision by less than the ties themselves do.
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.evaluation.detection.average_precision import (
-    PROTOCOLS,
-    DetectionProtocol,
+from manyeyes.evaluation.detection.frame_match import (
     FrameMatch,
+    RankedMatches,
     count_truth,
+    rank_matches,
     sort_by_frame,
 )
+from manyeyes.evaluation.detection.protocols import PROTOCOLS, DetectionProtocol
 from manyeyes.ops.keyed_random import keyed_uniform
 
 _CHUNK_ROWS = 4_000_000
@@ -51,14 +52,19 @@ class Interval:
 class PooledMatches:
     """Detections of many scenarios as one list in the protocol's order.
 
-    tp: (D,) bool; scenario_row: (D,) row of names; n_gt: (S,) truth boxes of each scenario.
+    ranked: the list; scenario_row: (D,) row of names; n_gt: (S,) truth boxes of each scenario.
     """
 
     names: tuple[str, ...]
-    tp: np.ndarray
+    ranked: RankedMatches
     scenario_row: np.ndarray
     n_gt: np.ndarray
-    drop_first_segment: bool
+    protocol: DetectionProtocol
+
+    @property
+    def tp(self) -> np.ndarray:
+        """(D,) bool."""
+        return self.ranked.tp
 
 
 Statistic = Callable[[PooledMatches, np.ndarray], np.ndarray]
@@ -72,13 +78,15 @@ def weighted_ap(pool: PooledMatches, weights: np.ndarray) -> np.ndarray:
     step = max(1, _CHUNK_ROWS // max(1, len(pool.tp)))
     for begin in range(0, len(weights), step):
         rows = slice(begin, begin + step)
-        weight = weights[rows][:, pool.scenario_row].astype(np.float64)
-        gain = weight * pool.tp
+        drawn = weights[rows][:, pool.scenario_row].astype(np.float64)
+        weight, gain = pool.ranked.sum_groups(drawn), pool.ranked.sum_groups(drawn * pool.tp)
         seen = np.cumsum(weight, 1)
         precision = np.cumsum(gain, 1) / np.maximum(seen, 1)
         envelope = np.maximum.accumulate(precision[:, ::-1], 1)[:, ::-1]
-        if pool.drop_first_segment:
-            gain -= pool.tp * ((seen == weight) & (weight > 0))
+        if pool.protocol.drop_first_segment:
+            is_first = (seen == weight) & (weight > 0)
+            # Of several copies of the first detection only the first is left out, unless copies are one step.
+            gain -= np.where(is_first, gain if pool.protocol.ties == "together" else np.minimum(gain, 1), 0)
         with np.errstate(invalid="ignore", divide="ignore"):
             ap[rows] = np.where(n_gt[rows] > 0, (gain * envelope).sum(1) / n_gt[rows], np.nan)
     return ap
@@ -163,15 +171,9 @@ def _pool_matches(matches: Sequence[FrameMatch], protocol: DetectionProtocol) ->
     n_gt = np.zeros(len(names), dtype=np.int64)
     for match in matches:
         n_gt[row[match.scenario]] += count_truth(match, protocol)
-    if not matches:
-        return PooledMatches(
-            names, np.zeros(0, dtype=bool), np.zeros(0, dtype=np.int64), n_gt, protocol.drop_first_segment
-        )
-    tp = np.concatenate([match.tp.numpy() for match in matches])
-    scenario = np.repeat([row[match.scenario] for match in matches], [len(match.score) for match in matches])
-    score = np.concatenate([match.score.numpy() for match in matches])
-    order = np.argsort(-score, kind="stable") if protocol.ap_order == "global" else np.arange(len(score))
-    return PooledMatches(names, tp[order], scenario[order], n_gt, protocol.drop_first_segment)
+    ranked = rank_matches(matches, protocol, protocol.ap_order)
+    frame_scenario = np.array([row[match.scenario] for match in matches], dtype=np.int64)
+    return PooledMatches(names, ranked, frame_scenario[ranked.frame], n_gt, protocol)
 
 
 def exact_interval(value: float) -> Interval:

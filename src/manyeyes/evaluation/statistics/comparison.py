@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS, MethodResult
-from manyeyes.evaluation.detection.average_precision import DetectionProtocol
+from manyeyes.evaluation.detection.protocols import DetectionProtocol
 from manyeyes.evaluation.statistics.bootstrap import Interval
 
 
@@ -28,17 +28,18 @@ class Comparison:
 def compare_methods(
     results: Sequence[MethodResult], protocol: DetectionProtocol, method: str = "intermediate"
 ) -> tuple[Comparison, ...]:
-    """Compare one method with every other, at every IoU threshold; nothing where the method was not run."""
-    by_name = {result.method: result for result in results}
-    if method not in by_name:
-        return ()
+    """Compare one method with every other, at every IoU threshold and of every class; nothing where the method was not run."""
+    classes = list(dict.fromkeys(result.class_name for result in results))
+    ours = {result.class_name: result for result in results if result.method == method}
     return tuple(
         Comparison(
-            f"{method} - {baseline.method}",
+            f"{method} - {baseline.method}{f', {name}' if len(classes) > 1 else ''}",
             f"AP@{iou:g}",
-            by_name[method].paired_difference(baseline, column, protocol),
+            ours[name].paired_difference(baseline, column, protocol),
         )
+        for name in classes
+        if name in ours
         for baseline in results
-        if baseline.method != method
+        if baseline.class_name == name and baseline.method != method
         for column, iou in enumerate(IOU_THRESHOLDS)
     )

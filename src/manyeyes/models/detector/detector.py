@@ -100,6 +100,11 @@ class Detector(nn.Module):
         return self.head.out.weight.device
 
     @property
+    def classes(self) -> tuple[str, ...]:
+        """Classes of objects that are detected, and evaluated apart."""
+        return self.config.classes
+
+    @property
     def token_grid(self) -> BevGrid:
         """The grid of the tokens."""
         return self.config.grid.at(self.config.encoder.head_stride)

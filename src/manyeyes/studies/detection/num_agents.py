@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.evaluation.detection.average_precision import get_protocol
+from manyeyes.evaluation.detection.protocols import get_protocol
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.studies.engine.conditions import Condition, ResultGrid, ResultKey
 from manyeyes.studies.engine.replay_study import NO_FUSION, prepare_study

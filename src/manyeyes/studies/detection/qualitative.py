@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 from manyeyes.agents.replay import ReplayStep, replay
 from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.evaluation.detection.accumulator import MetricAccumulator
-from manyeyes.evaluation.detection.average_precision import DetectionProtocol
 from manyeyes.evaluation.detection.benchmark import load_detector, resolve_protocol
+from manyeyes.evaluation.detection.protocols import DetectionProtocol
 from manyeyes.models.detector.protocols import BoxDetector
 from manyeyes.models.score_calibration import default_drawing_score
 from manyeyes.studies.detection.perturbations import COMBINED

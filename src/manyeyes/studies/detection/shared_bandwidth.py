@@ -62,7 +62,7 @@ def make_rows(results: ResultGrid) -> tuple[SharedBandwidthRow, ...]:
             SharedBandwidthRow(
                 None if name == NO_BUDGET else int(name),
                 method,
-                len(result.matches[0]),
+                result.num_frames,
                 results.ap_pair(key),
                 results.paired_difference(key, no_fusion_key, 0)
                 if no_fusion_key in results.results and key != no_fusion_key

@@ -18,12 +18,24 @@ from torch import Tensor
 
 from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.datasets.base import Recording
-from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS, MetricAccumulator
-from manyeyes.evaluation.detection.average_precision import DetectionProtocol, FrameMatch
-from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, load_detector, resolve_protocol, run_benchmarks
+from manyeyes.evaluation.detection.accumulator import DEFAULT_THRESHOLD, IOU_THRESHOLDS, MetricAccumulator
+from manyeyes.evaluation.detection.benchmark import (
+    BenchmarkConfig,
+    find_thresholds,
+    load_detector,
+    resolve_protocol,
+    run_benchmarks,
+)
 from manyeyes.evaluation.detection.communication import Communication
+from manyeyes.evaluation.detection.frame_match import FrameMatch
+from manyeyes.evaluation.detection.protocols import DetectionProtocol
 from manyeyes.evaluation.statistics.bootstrap import BootstrapSamples, Interval, bootstrap
 from manyeyes.evaluation.statistics.comparison import Comparison
+from manyeyes.evaluation.statistics.operating_point import (
+    OperatingPoint,
+    OperatingThreshold,
+    compute_operating_point,
+)
 from manyeyes.models.checkpoint import fingerprint
 from manyeyes.pose.registry import load_corrector
 from manyeyes.studies.engine.cells import Cell, CellStore, hash_recording, third_party_source
@@ -51,8 +63,8 @@ class BusVolume:
 
 @dataclass(frozen=True)
 class MethodMatches:
-    """A method in a condition. matches: every evaluated frame at each of IOU_THRESHOLDS; speeds: (G,) m/s of each frame's true
-    boxes.
+    """A method in a condition. matches: every evaluated frame, of every class, at each of IOU_THRESHOLDS; speeds: (G,) m/s of the
+    true boxes of each of them. num_frames: evaluated, whatever the number of classes.
     """
 
     method: str
@@ -61,6 +73,7 @@ class MethodMatches:
     communication: Communication
     volume: BusVolume
     age_ms: float
+    num_frames: int
 
     @property
     def bytes_per_message(self) -> float:
@@ -68,10 +81,14 @@ class MethodMatches:
         return self.communication.bytes_per_message if self.communication.num_messages else 0.0
 
     def select_matches(
-        self, iou: int, scenarios: Collection[str] | None = None, speed_range: SpeedRange | None = None
+        self,
+        iou: int,
+        class_name: str,
+        scenarios: Collection[str] | None = None,
+        speed_range: SpeedRange | None = None,
     ) -> list[FrameMatch]:
-        """Select the frames matched at IOU_THRESHOLDS[iou]: of these scenarios alone, of one class of speeds alone."""
-        pairs = zip(self.matches[iou], self.speeds)
+        """Select the frames of a class matched at IOU_THRESHOLDS[iou]: of these scenarios alone, of one class of speeds alone."""
+        pairs = [(match, v) for match, v in zip(self.matches[iou], self.speeds) if match.class_name == class_name]
         kept = [(match, v) for match, v in pairs if scenarios is None or match.scenario in scenarios]
         return [match if speed_range is None else filter_by_speed(match, v, speed_range) for match, v in kept]
 
@@ -81,7 +98,13 @@ def filter_by_speed(match: FrameMatch, speed: Tensor, speed_range: SpeedRange) -
     inside = (speed >= speed_range[0]) & (speed < speed_range[1])
     # Row -1 indexes the last entry, which is kept: a false positive stays one.
     mask = torch.cat((inside, torch.ones(1, dtype=torch.bool)))[match.truth_row]
-    return FrameMatch(match.scenario, match.index, match.score[mask], match.truth_row[mask], int(inside.sum()))
+    return replace(
+        match,
+        score=match.score[mask],
+        truth_row=match.truth_row[mask],
+        n_gt=int(inside.sum()),
+        overlap_row=None if match.overlap_row is None else match.overlap_row[mask],
+    )
 
 
 def summarize_metrics(metrics: MetricAccumulator) -> MethodMatches:
@@ -97,7 +120,15 @@ def summarize_metrics(metrics: MetricAccumulator) -> MethodMatches:
         max(snapshot_bytes.values(), default=0),
     )
     communication, speeds = metrics.summarize_communication(), tuple(metrics.speeds)
-    return MethodMatches(metrics.method, metrics.match_frames(), speeds, communication, volume, metrics.mean_age_ms())
+    return MethodMatches(
+        metrics.method,
+        metrics.match_frames(),
+        speeds,
+        communication,
+        volume,
+        metrics.mean_age_ms(),
+        len(metrics.perceive_s),
+    )
 
 
 @dataclass(frozen=True)
@@ -110,10 +141,14 @@ class Condition:
 
 @dataclass(frozen=True)
 class ResultGrid:
-    """The cells of a study by condition and method, and what follows from them. iou: row of IOU_THRESHOLDS."""
+    """The cells of a study by condition and method, and what follows from them. iou: row of IOU_THRESHOLDS.
+
+    protocol: of the one class that the numbers are of. thresholds: of each cell's operating point.
+    """
 
     results: dict[ResultKey, MethodMatches]
     protocol: DetectionProtocol
+    thresholds: dict[ResultKey, OperatingThreshold] = field(default_factory=dict)
     _bootstraps: dict[object, BootstrapSamples] = field(default_factory=dict, repr=False, compare=False)
 
     def bootstrap_ap(
@@ -125,6 +160,18 @@ class ResultGrid:
     def ap_pair(self, key: ResultKey) -> tuple[Interval, Interval]:
         """Return the AP of a cell at both IoU thresholds."""
         return self.bootstrap_ap(key, 0), self.bootstrap_ap(key, 1)
+
+    def compute_operating_point(self, key: ResultKey) -> OperatingPoint:
+        """Return the metrics of a cell at its score threshold, at the first of IOU_THRESHOLDS."""
+        frames = self.results[key].select_matches(0, self.protocol.class_name)
+        return compute_operating_point(frames, self.thresholds.get(key, DEFAULT_THRESHOLD), self.protocol)
+
+    def legacy_ap_pair(self, key: ResultKey) -> tuple[Interval, Interval]:
+        """Return the AP of a cell over concatenated frames at both IoU thresholds."""
+        protocol = replace(self.protocol, ap_order="concatenated")
+        name, result = protocol.class_name, self.results[key]
+        half, seven = (bootstrap(result.select_matches(iou, name), protocol=protocol).interval() for iou in (0, 1))
+        return half, seven
 
     def paired_difference(
         self, key: ResultKey, other: ResultKey, iou: int, scenarios: Collection[str] | None = None
@@ -152,7 +199,7 @@ class ResultGrid:
     ) -> BootstrapSamples:
         cache_key = (key, iou, speeds, None if scenarios is None else frozenset(scenarios))
         if cache_key not in self._bootstraps:
-            frames = self.results[key].select_matches(iou, scenarios, speeds)
+            frames = self.results[key].select_matches(iou, self.protocol.class_name, scenarios, speeds)
             self._bootstraps[cache_key] = bootstrap(frames, protocol=self.protocol)
         return self._bootstraps[cache_key]
 
@@ -163,8 +210,11 @@ def run_conditions(
     store: CellStore,
     workers: int = 1,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    object_class: str | None = None,
 ) -> ResultGrid:
     """Load every method of every condition from the store, or play it now and store it.
+
+    object_class: whose numbers the grid gives, by default the first of the detector; cells hold all classes.
 
     progress counts scenarios of conditions that are still to be played. Conditions of one configuration but for its methods
     should be one: methods of one condition process each cloud once.
@@ -180,7 +230,17 @@ def run_conditions(
                 key = condition.name, metrics.method
                 stored[key] = summarize_metrics(metrics)
                 store.save(cells[key], stored[key])
-    return ResultGrid({key: stored[key] for key in cells}, resolve_protocol(conditions[0].config))
+    protocol = resolve_protocol(conditions[0].config)
+    thresholds = {
+        (c.name, m): find_thresholds(load_detector(c.config.weights), m)[object_class or protocol.classes[0]]
+        for c in conditions
+        for m in c.config.methods
+    }
+    return ResultGrid(
+        {key: stored[key] for key in cells},
+        protocol.with_classes((object_class or protocol.classes[0],)),
+        thresholds,
+    )
 
 
 def make_cell(config: BenchmarkConfig, method: str, recording_hash: str) -> Cell[MethodMatches]:

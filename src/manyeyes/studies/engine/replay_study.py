@@ -12,7 +12,7 @@ from manyeyes.datasets.base import RecordingReader
 from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.datasets.registry import open_recording
 from manyeyes.datatypes import ConfigError
-from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
+from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, check_class, list_classes, load_detector
 from manyeyes.studies.engine.conditions import Condition, ResultGrid, run_conditions
 from manyeyes.studies.engine.report import StudyContext
 from manyeyes.studies.options import EvaluationOptions, RecordingStudyOptions
@@ -32,13 +32,18 @@ PAPER_NOTE = (
 
 @dataclass(frozen=True)
 class ReplayStudy:
-    """A study of a recording. base: the configuration that conditions change; pose_noise: the kind of their pose errors."""
+    """A study of a recording.
+
+    base: the configuration that conditions change. pose_noise: the kind of their pose errors. object_class: None is the first of
+    the weights.
+    """
 
     context: StudyContext
     opener: Callable[[], RecordingReader]
     base: BenchmarkConfig
     workers: int = 1
     pose_noise: PoseNoise = PoseNoise()
+    object_class: str | None = None
 
     @property
     def title(self) -> str:
@@ -47,12 +52,14 @@ class ReplayStudy:
         assert isinstance(options, RecordingStudyOptions)
         frames = sum(len(recording.eval_indices(name)) for name in recording.scenarios)
         data_name = f"{options.data.name}{f'/{options.split}' if options.split else ''}"
-        return f"{display_name(str(self.base.weights))} on {data_name}: {len(recording.scenarios)} scenarios, {frames} frames"
+        size = f"{len(recording.scenarios)} scenarios, {frames} frames"
+        class_name = f", {self.object_class}" if self.object_class else ""
+        return f"{display_name(str(self.base.weights))} on {data_name}: {size}{class_name}"
 
     def run(self, conditions: Sequence[Condition]) -> ResultGrid:
         """Run all conditions; stored results are not computed again."""
         with track(self.context.console, "Evaluating") as report:
-            return run_conditions(self.opener, conditions, self.context.store, self.workers, report)
+            return run_conditions(self.opener, conditions, self.context.store, self.workers, report, self.object_class)
 
     def write_report(
         self,
@@ -85,9 +92,15 @@ def prepare_study(options: EvaluationOptions, context: StudyContext, all_egos: b
     config = BenchmarkConfig(replay_options.weights, replay_options.methods, options.protocol, replay)
     study = open_study(options, context, config)
     replay = adapt_to_dataset(replay, replay_options, study.opener())
-    errors = options.pose_errors
-    base = replace(study.base, replay=replay, odometry_drift=errors.make_odometry_drift(options.seed))
-    return replace(study, base=base, workers=options.workers, pose_noise=errors.make_pose_noise(options.seed))
+    errors, classes = options.pose_errors, list_classes(load_detector(study.base.weights))
+    check_class(options.object_class, classes)
+    return replace(
+        study,
+        base=replace(study.base, replay=replay, odometry_drift=errors.make_odometry_drift(options.seed)),
+        workers=options.workers,
+        pose_noise=errors.make_pose_noise(options.seed),
+        object_class=options.object_class or (classes[0] if len(classes) > 1 else None),
+    )
 
 
 def resolve_token_selection(names: Sequence[str]) -> tuple[str, ...]:

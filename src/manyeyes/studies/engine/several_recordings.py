@@ -40,7 +40,12 @@ class SeveralRecordings:
             for name, grid in grids.items()
             for (condition, method), result in grid.results.items()
         }
-        return ResultGrid(merged, next(iter(grids.values())).protocol)
+        thresholds = {
+            (join_name(name, condition), method): threshold
+            for name, grid in grids.items()
+            for (condition, method), threshold in grid.thresholds.items()
+        }
+        return ResultGrid(merged, next(iter(grids.values())).protocol, thresholds)
 
 
 def join_name(recording: str, condition: str) -> str:

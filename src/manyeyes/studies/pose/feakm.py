@@ -65,6 +65,7 @@ def make_rows(study: ReplayStudy, variants: Sequence[tuple[FeakmVariant, str]]) 
     """Return rows of every variant and its minimum number of pairs, as it was written; stored ones are not computed again."""
     recording, seed = study.base.filter_recording(study.opener()), study.context.seed
     protocol = resolve_protocol(study.base)
+    protocol = protocol.with_classes(protocol.classes[:1])
     data_key = hash_recording(recording), SIGMAS, seed, protocol
     out = list[FeakmVariantRow]()
     with make_progress_bars(study.context.console) as progress:
