@@ -7,7 +7,8 @@ are those of the presets smoke-opv2v and dair-crossing on the generated towns of
 range of the detector. Two hundred steps show that a preset learns; they do not rank networks.
 Stopped runs go on: each run keeps its state in its folder, every 10 steps, and finished evaluations are kept.
 
-python benchmarks/preset_steps.py [--steps 200] [--data data/preset_steps] [--runs runs/preset_steps] [--frames 40]
+python benchmarks/preset_steps.py [--presets costr-opv2v costr-dair] [--steps 200] [--data data/preset_steps]
+    [--runs runs/preset_steps] [--frames 40] [--out benchmarks/results/preset_steps.json]
 """
 
 from __future__ import annotations
@@ -104,6 +105,7 @@ def simulate_scenes(preset: str, root: Path) -> Path:
 def main() -> None:
     """Train and evaluate both networks of both presets, print and store."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--presets", nargs="+", choices=list(SCENES), default=list(SCENES))
     parser.add_argument("--steps", type=int, default=200)
     parser.add_argument("--frames", type=int, default=40, help="frames that are evaluated at most")
     parser.add_argument("--data", type=Path, default=Path("data/preset_steps"))
@@ -113,7 +115,7 @@ def main() -> None:
     torch.set_num_threads(1)
     rows = [
         find_row(root, preset, network, given.steps, given.runs, given.frames)
-        for preset, root in [(preset, simulate_scenes(preset, given.data)) for preset in SCENES]
+        for preset, root in [(preset, simulate_scenes(preset, given.data)) for preset in given.presets]
         for network in NETWORKS
     ]
     for row in rows:
