@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from manyeyes._bounds import BatchSize, LoaderCount
 
@@ -19,5 +20,7 @@ class ComputeOptions:
     micro_batch: BatchSize | None = None
     """Samples that a process holds in memory together; gradients accumulate over the parts of its batch. Batch norms see one part
     at a time, so that the result differs from that of the whole batch."""
+    precision: Literal["float32", "bfloat16"] | None = None
+    """Of products in convolutions and attention, instead of the preset's; bfloat16 is for GPUs, and gains nothing on the CPU."""
     tensorboard: bool = False
     """Writes scalars of every step, and pictures at every validation, to the folder tensorboard of a stage (extra train)."""

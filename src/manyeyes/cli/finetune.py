@@ -92,7 +92,9 @@ def _finetune(options: Options, execution: Execution, console: Console) -> None:
     console.print(f"{num_frames} frames for training, {num_held} held out; {steps} steps", highlight=False)
     with pretrained.open_detector_file(options.weights) as start, make_progress_bars(console) as bars:
         plan = make_finetune_plan(checkpoint.load(start).config, steps, options.learning_rate, options.codebook)
-        plan = plan.change_stages(micro_batch=options.compute.micro_batch)
+        plan = plan.change_stages(
+            micro_batch=options.compute.micro_batch, precision=options.compute.precision or "float32"
+        )
         origin = provenance.collect_provenance({"options": options, "training": plan}, options.seed)
         card: dict[str, Any] = {name: origin[name] for name in ("command", "versions", "git_commit")}
         card |= {"finetuned_from": options.weights, "data": [str(path) for path in options.data]}

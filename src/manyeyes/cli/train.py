@@ -144,7 +144,7 @@ def choose_preset(options: Options) -> TrainConfig | TrainPlan:
     if len(options.weights) > 1 and not isinstance(chosen, MapTrainConfig):
         raise ConfigError(f"--weights takes one file for {options.preset}; got {len(options.weights)}.")
     given = {name: getattr(options, name) for name in _REPLACED}
-    given["micro_batch"] = options.compute.micro_batch
+    given |= {name: getattr(options.compute, name) for name in ("micro_batch", "precision")}
     given = {name: value for name, value in given.items() if value is not None}
     if not isinstance(chosen, TrainPlan):
         return _change_config(chosen, options.fusion, given)

@@ -5,7 +5,8 @@ A layer takes, tap by tap, the rows that a tap meets, multiplies them by its mat
 pairs that exist are multiplied (six of nine on a street). On the CPU float32 goes through one compiled loop where it can;
 all else is gathered in blocks that stay in the cache. A tap leads to a row once at most, so that results do not depend on
 threads. Backward does the same with the pairs turned round.
-Semantics: cross-correlation as in ``conv2d``; a bias is added to active rows alone; output keys are ascending.
+Semantics: cross-correlation as in ``conv2d``; a bias is added to active rows alone; output keys are ascending. Rows of bfloat16
+give rows of float32 (``ops.bfloat16_products``).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from torch import Tensor
 from manyeyes.datatypes import BevGrid, ConfigError, ShapeError, Sites, SparseBev
 from manyeyes.ops._outer_product_kernels import sum_outer_products
 from manyeyes.ops._sparse_conv_kernels import LANES, convolve, panels
+from manyeyes.ops.bfloat16_products import bfloat16_linear, round_to_bfloat16
 from manyeyes.ops.gathered_conv import gathered_conv
 from manyeyes.ops.sparse_index import (
     NeighbourMap,
@@ -189,11 +191,23 @@ def _kernel(weight: Tensor, channels: int, axis: int) -> int:
 
 
 def _affine(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
+    if x.dtype == torch.bfloat16:
+        return bfloat16_linear(x, weight, bias)
     return torch.nn.functional.linear(x, weight.to(x.dtype), None if bias is None else bias.to(x.dtype))
 
 
 def _conv(x: Tensor, weight: Tensor, bias: Tensor | None, table: NeighbourMap, reverse: bool = False) -> Tensor:
     """Convolve rows (N_in, in) to (N_out, out); weight (out, in, k, k)."""
+    if x.dtype != torch.bfloat16:
+        return _multiply(x, weight, bias, table, reverse)
+    if x.device.type == "cpu":
+        return _multiply(x.float(), round_to_bfloat16(weight), bias, table, reverse)
+    out = _multiply(x, weight, None, table, reverse).float()
+    return out if bias is None else out + bias
+
+
+def _multiply(x: Tensor, weight: Tensor, bias: Tensor | None, table: NeighbourMap, reverse: bool) -> Tensor:
+    """Convolve rows in their own type."""
     # (taps, in, out): one matrix for each tap.
     taps = weight.to(x.dtype).permute(2, 3, 1, 0).reshape(-1, weight.shape[1], weight.shape[0])
     table = table.on(x.device)

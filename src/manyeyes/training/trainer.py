@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from manyeyes._io import atomic_write, atomic_write_text, flush_files, name_errors
 from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.models import checkpoint
+from manyeyes.training.mixed_precision import Precision, multiply_in_bfloat16
 from manyeyes.training.monitor import Monitor, Progress
 from manyeyes.training.optimiser import AveragedWeights, clip_gradients, load_optimiser, make_optimiser, to_cpu
 from manyeyes.training.prefetch import prefetch
@@ -56,6 +57,7 @@ class TrainConfig:
         save_every: steps between two saves of the training state.
         validate_every: steps between two measurements on a recording of validation, whose best weights are the result; 0 for none.
         validate_frames: maximum number of frames of a measurement, the same ones each time, spread evenly.
+        precision: of products of convolutions and attention; see training/mixed_precision.py.
     """
 
     steps: int
@@ -70,6 +72,7 @@ class TrainConfig:
     save_every: int = 200
     validate_every: int = 0
     validate_frames: int = 40
+    precision: Precision = "float32"
 
 
 class Task(ABC, Generic[Config, Model, Sample]):
@@ -168,6 +171,8 @@ class Trainer(Generic[Model, Sample]):
         begun = checkpoint.fingerprint(self.model).hex() if task.is_initialised else ""
         self.model.to(self.device)
         self.average = copy.deepcopy(self.model).requires_grad_(False)
+        if task.config.precision == "bfloat16":
+            multiply_in_bfloat16(self.model)
         self._averaged_weights = AveragedWeights(self.average, self.model)
         self.optimiser = make_optimiser(self.model, task.config.weight_decay, task.config.beta2)
         self.step, self.seconds = 0, 0.0

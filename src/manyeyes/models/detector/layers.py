@@ -84,7 +84,17 @@ def _apply_relu(y: Tensor, skip: Tensor | None) -> Tensor:
     return torch.relu_(y if skip is None else y.add_(skip))
 
 
-class SubmanifoldLayer(nn.Module):
+class SparseConvLayer(nn.Module):
+    """A layer with a sparse convolution. in_bfloat16: multiply in bfloat16, with float32 results, for training."""
+
+    in_bfloat16: bool = False
+
+    def round_input(self, x: SparseBev) -> SparseBev:
+        """Return the input of the convolution, in bfloat16 where it multiplies so."""
+        return x.with_features(x.features.to(torch.bfloat16)) if self.in_bfloat16 else x
+
+
+class SubmanifoldLayer(SparseConvLayer):
     """Submanifold convolution, norm, optional skip connection, ReLU; the sites are unchanged.
 
     norm: ActiveNorm, or LayerNorm where inputs of different statistics share the weights (one agent, several agents).
@@ -105,7 +115,7 @@ class SubmanifoldLayer(nn.Module):
         """Map (N, inputs) to (N, outputs) on the same sites."""
         if self.folded is not None and is_supported(x.features):
             return x.with_features(self.folded(x.features, same_sites_map(x.sites, self.weight.shape[2])))
-        y = submanifold_conv(x, self.weight, self.bias).features
+        y = submanifold_conv(self.round_input(x), self.weight, self.bias).features
         return x.with_features(_norm_relu(self.norm, y, x.features if self.skip else None))
 
     def fold(self, in_bfloat16: bool = False) -> None:
@@ -151,7 +161,7 @@ class SubmanifoldStage(nn.Sequential):
         )
 
 
-class DownLayer(nn.Module):
+class DownLayer(SparseConvLayer):
     """3x3 convolution of stride 2, norm, ReLU; ``dilating`` selects spconv's active set, else parents of active
     cells.
     """
@@ -170,7 +180,7 @@ class DownLayer(nn.Module):
         if self.folded is not None and is_supported(x.features):
             sites, table = strided_map(x.sites, Window(3, 2, 1), self.dilating)
             return SparseBev(self.folded(x.features, table), sites)
-        y = strided_conv(x, self.weight, self.bias, stride=2, padding=1, dilating=self.dilating)
+        y = strided_conv(self.round_input(x), self.weight, self.bias, stride=2, padding=1, dilating=self.dilating)
         return y.with_features(_norm_relu(self.norm, y.features, None))
 
     def fold(self, in_bfloat16: bool = False) -> None:
@@ -181,7 +191,7 @@ class DownLayer(nn.Module):
             self.folded = FoldedConvs.of([self.weight], [self.bias], in_bfloat16=in_bfloat16)
 
 
-class UpLayer(nn.Module):
+class UpLayer(SparseConvLayer):
     """Inverse convolution to finer sites, norm, added to a lateral projection, ReLU."""
 
     bias: Tensor | None
@@ -200,7 +210,7 @@ class UpLayer(nn.Module):
         sites: Sites = fine.sites
         if self.folded is not None and is_supported(coarse.features) and is_supported(fine.features):
             return fine.with_features(self.folded(coarse.features, fine.features, inverse_map(sites, coarse.sites)))
-        y = inverse_conv(coarse, self.weight, sites, self.bias, stride=2, padding=1)
+        y = inverse_conv(self.round_input(coarse), self.weight, sites, self.bias, stride=2, padding=1)
         return fine.with_features(_norm_relu(self.norm, y.features + self.lateral(fine.features), None))
 
     def fold(self, in_bfloat16: bool = False) -> None:
