@@ -128,7 +128,8 @@ def iterate_frames(recording: Recording, stride: int) -> Iterator[tuple[int, str
 
 def true_boxes(truth: GroundTruth, row: int, agent_id: int) -> Boxes:
     """Return all vehicles but the agent's own body, in its frame."""
-    others = truth.boxes[truth.boxes.id != agent_id]
+    vehicles = truth.boxes.of_classes()
+    others = vehicles[vehicles.id != agent_id]
     return others.transform(truth.world_from_agent[row].inverse()).to(torch.float32)
 
 

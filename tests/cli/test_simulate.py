@@ -152,13 +152,13 @@ def test_an_interrupted_run_continues_and_is_known_by_its_seed(
 ) -> None:
     write, calls = record._write, []
 
-    def stopped(scenario: object, partial: Path) -> int:
+    def stopped(job: object, scenario: object, partial: Path) -> int:
         calls.append(partial)
         if len(calls) > finished:
             partial.mkdir(parents=True)
             (partial / "half").write_text("")
             raise KeyboardInterrupt
-        return write(scenario, partial)  # pyright: ignore[reportArgumentType]
+        return write(job, scenario, partial)  # pyright: ignore[reportArgumentType]
 
     root = tmp_path / "small"
     with monkeypatch.context() as patch:

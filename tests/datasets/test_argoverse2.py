@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -68,16 +69,19 @@ def test_the_log_as_a_recording(recording: Argoverse2Recording, pair: Snapshot) 
 
 
 @real
-def test_ground_truth_lists_vehicles_and_the_agents_with_returns(
+def test_ground_truth_lists_objects_by_class_and_the_agents_with_returns(
     recording: Argoverse2Recording, pair: Snapshot
 ) -> None:
     assert pair.truth is not None
-    assert len(pair.truth.boxes) == len(pair.truth.boxes.id.unique()) == 47
-    assert torch.bincount(pair.truth.boxes.label, minlength=4).tolist() == [44, 0, 3, 0]
-    counts = count_points_in_listed_boxes(pair, 0.1)
+    assert len(pair.truth.boxes) == len(pair.truth.boxes.id.unique()) == 72
+    assert torch.bincount(pair.truth.boxes.label, minlength=7).tolist() == [44, 0, 3, 0, 15, 7, 3]
+    vehicles = replace(pair, truth=pair.truth.of_classes())
+    assert vehicles.truth is not None and len(vehicles.truth.boxes) == 47
+    counts = count_points_in_listed_boxes(vehicles, 0.1)
     # Boxes are those of the ego's time; what drives on for 0.1 s still holds points of the second sweep, almost always.
     assert int((counts[0] == 0).sum()) == 0 and int((counts[1] == 0).sum()) <= 2
-    assert counts.max() > 500 and pair.truth.seen.sum(1).tolist() == [40, 40]
+    assert counts.max() > 500 and vehicles.truth.seen.sum(1).tolist() == [40, 40]
+    assert int((count_points_in_listed_boxes(pair, 0.1)[0] == 0).sum()) == 0
 
 
 @real
@@ -159,11 +163,12 @@ def test_a_log_by_hand(log: Path) -> None:
     assert first.points.xyz[0].tolist() == pytest.approx([19, 4, 0.83])
     assert first.world_from_agent.translation[2] == pytest.approx(9.67)
     assert snapshot.truth is not None
-    assert [LABELS[i] for i in snapshot.truth.boxes.label] == ["bus", "car"]  # in the order of their tracks, a and c
-    assert snapshot.truth.boxes.yaw.tolist() == pytest.approx([1.0, 1.0])
+    # In the order of their tracks.
+    assert [LABELS[i] for i in snapshot.truth.boxes.label] == ["bus", "pedestrian", "car"]
+    assert snapshot.truth.boxes.yaw.tolist() == pytest.approx([1.0, 1.0, 1.0])
     wanted = 500 + 20 * np.cos(1.0) - 4 * np.sin(1.0), 300 + 20 * np.sin(1.0) + 4 * np.cos(1.0), 10.5
-    assert snapshot.truth.boxes.center[1].tolist() == pytest.approx(wanted)
-    assert count_points_in_listed_boxes(snapshot).tolist() == [[1, 1], [1, 1]]
+    assert snapshot.truth.boxes.center[2].tolist() == pytest.approx(wanted)
+    assert count_points_in_listed_boxes(snapshot).tolist() == [[1, 1, 1], [1, 1, 1]]
     # Two sweeps apart, and no label is no truth.
     assert Argoverse2Recording(log, gap=2).snapshot("abc", 0).frames[1].timestamp_ns == 1_200_000_000
     (log / "annotations.feather").unlink()
@@ -175,7 +180,7 @@ def test_without_a_gap_a_log_has_one_agent(log: Path) -> None:
     assert recording.length("abc") == 3 and recording.agents("abc") == (0,)
     snapshot = recording.snapshot("abc", 2)
     assert [(f.agent_id, f.timestamp_ns) for f in snapshot.frames] == [(0, 1_200_000_000)]
-    assert snapshot.truth is not None and snapshot.truth.seen.tolist() == [[True, True]]
+    assert snapshot.truth is not None and snapshot.truth.seen.tolist() == [[True, True, True]]
     with pytest.raises(ConfigError, match="gap of at least 0 sweeps; got -1"):
         Argoverse2Recording(log, gap=-1)
 
@@ -188,7 +193,28 @@ def test_a_track_of_the_later_sweep_alone_is_in_the_truth(log: Path) -> None:
     ]
     feather.write_feather(table.filter(pyarrow.array(keep)), log / "annotations.feather")
     truth = Argoverse2Recording(log, gap=1).snapshot("abc", 0).truth
-    assert truth is not None and truth.seen.tolist() == [[True, False], [True, True]]
+    assert truth is not None and truth.seen.tolist() == [[True, True, False], [True, True, True]]
+
+
+def test_a_bicycle_with_a_rider_counts_once_and_other_objects_do_not(log: Path) -> None:
+    path = log / "annotations.feather"
+    rows = feather.read_table(path).to_pylist()
+    first = next(row for row in rows if row["timestamp_ns"] == 1_000_000_000)
+    added = [
+        ("d", "BICYCLE", 40.0), ("e", "BICYCLIST", 40.3), ("f", "BICYCLE", 44.0), ("g", "MOTORCYCLE", 50.0),
+        ("h", "BOLLARD", 55.0), ("i", "WHEELED_RIDER", 60.0), ("j", "OFFICIAL_SIGNALER", 65.0), ("k", "RAILED_VEHICLE", 70.0),
+        ("l", "REGULAR_VEHICLE", 40.2),
+    ]  # fmt: skip
+    rows += [first | {"track_uuid": track, "category": category, "tx_m": x} for track, category, x in added]
+    feather.write_feather(pyarrow.Table.from_pylist(rows), path)
+    recording = Argoverse2Recording(log)
+    truth = recording.snapshot("abc", 0).truth
+    assert truth is not None
+    found = [LABELS[i] for i in truth.boxes.label]
+    assert found == ["bus", "pedestrian", "car", "cyclist", "cyclist", "motorcyclist", "cyclist", "pedestrian", "car"]
+    labelled = recording.annotations("abc", 1_000_000_000)
+    vehicles = [c for c, is_vehicle in zip(labelled.category, labelled.is_vehicle.tolist()) if is_vehicle]
+    assert vehicles == ["REGULAR_VEHICLE", "BUS", "REGULAR_VEHICLE"]
 
 
 def _drop_column(path: Path, name: str) -> None:

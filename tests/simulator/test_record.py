@@ -60,6 +60,27 @@ def test_two_processes_write_the_same_bytes(made: Path, tmp_path: Path) -> None:
     assert [p.done for p in seen] == [1, 2]
 
 
+def test_the_manifest_states_where_bodies_of_agents_are(made: Path) -> None:
+    assert json.loads((made / "manifest.json").read_text())["settings"] == {"agent_bodies": "apart"}
+    assert all(b"agent_bodies:" in content for name, content in files(made).items() if name.endswith("-1/000000.yaml"))
+
+
+def test_a_recording_that_lists_agents_goes_on_as_it_was_begun(tmp_path: Path) -> None:
+    """As recordings of versions before the setting, whose manifest does not have it."""
+    record([replace(JOBS[0], lists_agents=True), JOBS[1]], tmp_path)
+    begun = files(tmp_path)
+    assert json.loads(begun["manifest.json"])["settings"] == {} and not any(
+        b"agent_bodies" in f for f in begun.values()
+    )
+    shutil.rmtree(tmp_path / "train" / "two")
+    record(JOBS, tmp_path, on_repair=lambda problem: None)
+    assert files(tmp_path) == begun
+    (tmp_path / "manifest.json").unlink()
+    record(JOBS, tmp_path)
+    assert files(tmp_path) == begun
+    assert Opv2vRecording(tmp_path, "train").snapshot("two", 0).truth is not None
+
+
 def test_the_reader_returns_the_simulators_own_truth(made: Path) -> None:
     recording = Opv2vRecording(made, "train", strict=True, use_cache=False)
     assert recording.scenarios == ("one", "two")

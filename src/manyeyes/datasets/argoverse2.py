@@ -9,6 +9,7 @@ The world is the log's city frame.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,9 +19,9 @@ from torch import Tensor
 
 from manyeyes.datasets.base import RecordingReader, require_index
 from manyeyes.datasets.lidar_frame import rotation_of_quaternion
+from manyeyes.datasets.object_types import find_label
 from manyeyes.datasets.registry import register_dataset
 from manyeyes.datatypes import (
-    LABELS,
     AgentBody,
     AgentFrame,
     Boxes,
@@ -36,37 +37,33 @@ from manyeyes.datatypes.extras import import_extra
 _POSES = "city_SE3_egovehicle.feather"
 _AXLE_HEIGHT_M = 0.33
 _LIDAR_ABOVE_AXLE_M = 1.64
-# The vehicles are Ford Fusion Hybrids of 2013 to 2020: length, width and height by the maker; the middle of the body lies ahead of
-# the rear axle by half the length less the rear overhang.
+# Argo AI's fleet of those years were Ford Fusion Hybrids; length, width (without mirrors) and height by the maker: 191.8, 72.9 and
+# 58 inches. The middle of the body lies ahead of the rear axle by half the length less the rear overhang of 1.1 m, unverified.
 _BODY = AgentBody.standing(1.34, 0.0, (4.87, 1.85, 1.48))
 _REMEDY = "copy or download the file again"
 # Box ids start here, so that none is the id of an agent (0 and 1).
 _FIRST_BOX_ID = 100
-_LABEL_OF_CATEGORY = (
-    ("REGULAR_VEHICLE", "car"),
-    ("LARGE_VEHICLE", "truck"),
-    ("BOX_TRUCK", "truck"),
-    ("TRUCK", "truck"),
-    ("TRUCK_CAB", "truck"),
-    ("VEHICULAR_TRAILER", "truck"),
-    ("BUS", "bus"),
-    ("SCHOOL_BUS", "bus"),
-    ("ARTICULATED_BUS", "bus"),
-)
+_RIDDEN, _RIDERS = ("BICYCLE", "MOTORCYCLE"), ("BICYCLIST", "MOTORCYCLIST", "WHEELED_RIDER")
+_RIDER_DISTANCE_M = 0.8
 
 
 @dataclass(frozen=True)
 class Annotations:
     """All labelled objects of one sweep, of every category.
 
-    boxes: (N), float64, in AV2's ego frame; the label counts where is_vehicle (N,) is true. category: AV2's names.
+    boxes: (N), float64, in AV2's ego frame; the label counts where has_label (N,) is true. category: AV2's names.
     interior_points: (N,) int64, AV2's own count of the sweep's points inside each box.
     """
 
     boxes: Boxes
     category: tuple[str, ...]
-    is_vehicle: Tensor
+    has_label: Tensor
     interior_points: Tensor
+
+    @property
+    def is_vehicle(self) -> Tensor:
+        """(N,) bool: which objects are vehicles of four wheels and more."""
+        return self.has_label & (self.boxes.class_rows() >= 0)
 
 
 def contains_logs(path: Path) -> bool:
@@ -79,8 +76,9 @@ class Argoverse2Recording(RecordingReader):
     """Logs under a root or its split (or one log): snapshot i shows sweep i as agent 0, the ego.
 
     A log has one vehicle. With a gap above 0, sweep i + gap is agent 1: a pair of real clouds for Python; in a replay the later
-    sweep comes too late for the ego. True boxes are the vehicles at the ego's time, and those that only the later sweep has; an
-    agent has seen those that hold a point of its sweep. Logs without enough sweeps are named in ``missing_summary``.
+    sweep comes too late for the ego. True boxes are the vehicles, pedestrians and riders at the ego's time, and those that only the
+    later sweep has; an agent has seen those that hold a point of its sweep. A bicycle or motorcycle with a rider, which Argoverse 2
+    labels by a second box, is left out. Logs without enough sweeps are named in ``missing_summary``.
     """
 
     def __init__(self, root: Path | str, split: str | None = None, *, gap: int = 0) -> None:
@@ -156,18 +154,19 @@ class Argoverse2Recording(RecordingReader):
         here = time == timestamp_ns
         values = torch.from_numpy(np.stack([c[here] for c in self._table(path, names)], -1).astype(np.float64))
         rotation = rotation_of_quaternion(values[:, 6:])
-        labels = dict(_LABEL_OF_CATEGORY)
         found = tuple(str(c) for c in category[here])
+        labels = [find_label(c) for c in found]
         return Annotations(
             boxes=Boxes.of(
                 values[:, :3],
                 values[:, 3:6],
                 torch.atan2(rotation[:, 1, 0], rotation[:, 0, 0]),
-                label=torch.tensor([LABELS.index(labels.get(c, "car")) for c in found], dtype=torch.int64),
+                label=torch.tensor([label or 0 for label in labels], dtype=torch.int64),
                 id=torch.from_numpy(np.searchsorted(np.unique(track), track[here]) + _FIRST_BOX_ID),
             ),
             category=found,
-            is_vehicle=torch.tensor([c in labels for c in found], dtype=torch.bool),
+            has_label=torch.tensor([label is not None for label in labels], dtype=torch.bool)
+            & ~_has_rider(found, values[:, :2]),
             interior_points=torch.from_numpy(interior[here].astype(np.int64)),
         )
 
@@ -208,12 +207,12 @@ class Argoverse2Recording(RecordingReader):
         return float(np.linalg.norm(np.diff(place))) / elapsed if elapsed > 0 else 0.0
 
     def _truth(self, scenario: str, times: tuple[int, ...], frames: tuple[AgentFrame, ...]) -> GroundTruth:
-        """Return vehicles in the city frame: the ego's copy of a track where it has one, in the order of ids."""
+        """Return objects in the city frame: the ego's copy of a track where it has one, in the order of ids."""
         boxes, met = [], []
         for time in times:
             labelled = self.annotations(scenario, time)
-            boxes.append(labelled.boxes[labelled.is_vehicle].transform(self._city_from_ego(scenario, time)))
-            met.append(labelled.boxes.id[labelled.is_vehicle & (labelled.interior_points > 0)])
+            boxes.append(labelled.boxes[labelled.has_label].transform(self._city_from_ego(scenario, time)))
+            met.append(labelled.boxes.id[labelled.has_label & (labelled.interior_points > 0)])
         both = Boxes.cat(boxes)
         _, first = np.unique(both.id.numpy(), return_index=True)
         union = both[torch.from_numpy(first)]
@@ -225,6 +224,13 @@ class Argoverse2Recording(RecordingReader):
         if (path, names) not in self._tables:
             self._tables[path, names] = _columns(path, names)
         return self._tables[path, names]
+
+
+def _has_rider(category: Sequence[str], xy: Tensor) -> Tensor:
+    """Return (N,) bool: bicycles and motorcycles with a rider's box around the same place (N, 2)."""
+    rider, ridden = (torch.tensor([c in names for c in category], dtype=torch.bool) for names in (_RIDERS, _RIDDEN))
+    near = (xy[:, None] - xy[rider]).norm(dim=-1) < _RIDER_DISTANCE_M
+    return ridden & near.any(1)
 
 
 def _list_folders(folder: Path) -> list[Path]:

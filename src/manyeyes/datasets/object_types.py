@@ -17,7 +17,7 @@ _TYPES = {
         "boxtruck", "truckcab", "vehiculartrailer",
     ),
     "bus": ("bus", "tram", "schoolbus", "articulatedbus"),
-    "pedestrian": ("pedestrian", "person", "personsitting", "roadworker", "child"),
+    "pedestrian": ("pedestrian", "person", "personsitting", "roadworker", "child", "officialsignaler"),
     "cyclist": ("cyclist", "bicyclist", "bicyclerider", "bicycle", "tricyclist", "wheeledrider"),
     "motorcyclist": (
         "motorcyclist", "motorcyclerider", "motorcylerider", "motorcycle", "scooterrider", "scooter", "trimotorcycle",

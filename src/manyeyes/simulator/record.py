@@ -24,6 +24,7 @@ import torch
 
 from manyeyes._io import atomic_rename, atomic_write_text, flush_files, remove_unfinished
 from manyeyes._lock import hold_folder
+from manyeyes.datasets.formats.yaml_file import load_yaml
 from manyeyes.datasets.manifest import (
     MANIFEST,
     PARTIAL,
@@ -33,9 +34,11 @@ from manyeyes.datasets.manifest import (
     compute_total_digest,
     digest_files,
     list_scenario_files,
+    read_manifest,
 )
 from manyeyes.datasets.missing import FileProblem
 from manyeyes.datasets.opv2v import Opv2vWriter
+from manyeyes.datasets.opv2v.metadata import AGENT_BODIES, PROTOCOL
 from manyeyes.datatypes import ConfigError, ManyeyesError, RecordingError
 from manyeyes.maps.roads.road_network import RoadNetwork
 from manyeyes.simulator.folder_state import (
@@ -54,6 +57,8 @@ from manyeyes.simulator.folder_state import (
 from manyeyes.simulator.scene.scenario import RSU_ID, NoSceneError, ScenarioSpec, SimulatedScenario, make_scenario
 from manyeyes.simulator.scene.towns import load_town
 
+APART = "apart"
+"""Setting AGENT_BODIES of manifests and protocols where no agent lists the body of an agent as a vehicle; absent: agents do."""
 BEFORE_LAWS = {"intensity": "material"}
 """What a specification stated implicitly before it named an intensity law."""
 _STEP_S = 0.05
@@ -63,11 +68,16 @@ JobT = TypeVar("JobT")
 
 @dataclass(frozen=True)
 class Job:
-    """One scenario to write: folder of its split, first place to search for the roads of its town (None: the default places)."""
+    """One scenario to write.
+
+    split: folder. towns: first place to search for the roads of its town; None for the default places. lists_agents: as in
+    :class:`manyeyes.datasets.opv2v.Opv2vWriter`; a run sets it to what its folder has.
+    """
 
     split: str
     spec: ScenarioSpec
     towns: str | None = None
+    lists_agents: bool = False
 
 
 @dataclass(frozen=True)
@@ -105,8 +115,11 @@ def record(
     if len(set(names)) < len(names):
         raise ConfigError("Two scenarios of one split have one name; give each its own.")
     asked = {f"{job.split}/{job.spec.name}/{SCENARIO}": _plain(asdict(job.spec)) for job in jobs}
-    plan = RecordingPlan("OPV2V", settings or {}, asked, names)
     with hold_folder(root):
+        lists_agents = _lists_agents(root, any(job.lists_agents for job in jobs))
+        jobs = [replace(job, lists_agents=lists_agents) for job in jobs]
+        layout = {} if lists_agents else {AGENT_BODIES: APART}
+        plan = RecordingPlan("OPV2V", {**(settings or {}), **layout}, asked, names)
         found = sorted(p for p in root.glob(f"*/*/{SCENARIO}") if p.parent.suffix != PARTIAL)
         state = FolderState.read(root, plan, found, read_finished)
         require_own_folder(state, {place: content["spec"] for place, content in state.contents.items()})
@@ -117,6 +130,19 @@ def record(
             write_manifest(root, plan, [asdict(entries[name]) for name in names])
         (root / UNFINISHED_MANIFEST).unlink(missing_ok=True)
     return root / MANIFEST
+
+
+def _lists_agents(root: Path, wanted: bool) -> bool:
+    """Return whether agents list the bodies of agents as vehicles: as the folder's run did, else as wanted.
+
+    A recording that was begun before the setting existed has none, and goes on as it is.
+    """
+    content = read_manifest(root)
+    if content is not None:
+        return content["settings"].get(AGENT_BODIES) != APART
+    protocols = (path.with_name(PROTOCOL) for path in sorted(root.glob(f"*/*/{SCENARIO}")))
+    protocol = next((path for path in protocols if path.is_file()), None)
+    return wanted if protocol is None else load_yaml(protocol).get(AGENT_BODIES) != APART
 
 
 def keep_finished(
@@ -242,7 +268,7 @@ def record_scenario(job: Job, root: Path) -> ManifestEntry:
     folder = root / job.split / job.spec.name
     with clean_draft(folder.with_name(f"{folder.name}{PARTIAL}")) as draft:
         scenario = make_first_scenario(job.spec, job.towns)
-        entry = _finish(job, scenario, draft, _write(scenario, draft))
+        entry = _finish(job, scenario, draft, _write(job, scenario, draft))
         atomic_rename(draft, folder)
     return entry
 
@@ -253,10 +279,10 @@ def repair_scenario(damaged: tuple[Job, Damage], root: Path) -> ManifestEntry:
     with clean_draft(draft_of(root, damage.place)) as draft:
         scenario = make_first_scenario(job.spec, job.towns)
         if damage.names is None:
-            _finish(job, scenario, draft, _write(scenario, draft))
+            _finish(job, scenario, draft, _write(job, scenario, draft))
         else:
             stems = {Path(name).name.partition(".")[0].partition("_")[0] for name in damage.names}
-            _write(scenario, draft, {round(int(s) * _STEP_S * job.spec.rate_hz) for s in stems if s.isdigit()})
+            _write(job, scenario, draft, {round(int(s) * _STEP_S * job.spec.rate_hz) for s in stems if s.isdigit()})
         install_draft(root, damage)
     return damage.entry
 
@@ -303,11 +329,12 @@ def make_first_scenario(spec: ScenarioSpec, towns: str | None, roadside: bool = 
     raise NoSceneError(f"{spec.name}: none of {_ATTEMPTS} seeds gives a scene in {spec.town}; last: {reason}")
 
 
-def _write(scenario: SimulatedScenario, folder: Path, frames: Collection[int] | None = None) -> int:
+def _write(job: Job, scenario: SimulatedScenario, folder: Path, frames: Collection[int] | None = None) -> int:
     """Write the protocol and these frames, all for None; returns the number of points."""
     spec, points = scenario.spec, 0
     # What training draws other intensity laws from must not be rounded.
-    writer = Opv2vWriter(folder, _STEP_S, has_float_intensity=spec.sensor_mix != "none")
+    has_float_intensity = spec.sensor_mix != "none"
+    writer = Opv2vWriter(folder, _STEP_S, has_float_intensity=has_float_intensity, lists_agents=job.lists_agents)
     for index in range(len(scenario)) if frames is None else sorted(frames):
         snapshot = scenario.snapshot(index)
         writer.write(snapshot, torch.from_numpy(scenario.states[index].speed))
@@ -315,6 +342,7 @@ def _write(scenario: SimulatedScenario, folder: Path, frames: Collection[int] | 
     writer.close(
         {
             "history_frames": spec.lead_frames + spec.history_frames,
+            **({} if job.lists_agents else {AGENT_BODIES: APART}),
             "world": {"fixed_delta_seconds": _STEP_S, "town": spec.town, "seed": spec.seed},
             "simulation": asdict(spec),
             "lidar": {str(agent): scenario.lidar(agent).describe() for agent in _agents(scenario)},

@@ -569,14 +569,45 @@ def test_the_same_snapshot_gives_the_same_bytes(tmp_path: Path) -> None:
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
 
 
-def test_an_agent_never_lists_itself_but_others_list_it(tmp_path: Path) -> None:
+@pytest.mark.parametrize("lists_agents", [False, True])
+def test_an_agent_never_lists_itself_but_others_list_it(tmp_path: Path, lists_agents: bool) -> None:
     snapshot = drive_frame(agents=(1, 21))
     assert snapshot.truth is not None
     truth = replace(snapshot.truth, seen=torch.ones(2, 12, dtype=torch.bool))
-    Opv2vWriter(tmp_path / "drive").write(replace(snapshot, truth=truth))
+    Opv2vWriter(tmp_path / "drive", lists_agents=lists_agents).write(replace(snapshot, truth=truth))
     found = Opv2vRecording(tmp_path / "drive").snapshot("drive", 0).truth
     assert found is not None and found.boxes.id.tolist() == list(range(20, 32))
     assert found.seen[0].all() and found.seen[1].tolist() == [id != 21 for id in range(20, 32)]
+
+
+def test_agents_bodies_stand_apart_from_vehicles_as_opv2v_has_them(tmp_path: Path) -> None:
+    snapshot = drive_frame(agents=(22, 21, -1))
+    assert snapshot.truth is not None
+    snapshot = replace(snapshot, truth=replace(snapshot.truth, seen=torch.ones(3, 12, dtype=torch.bool)))
+    for name, lists_agents in (("apart", False), ("listed", True)):
+        Opv2vWriter(tmp_path / name, lists_agents=lists_agents).write(snapshot)
+    for agent in (22, 21, -1):
+        apart, listed = (
+            yaml.safe_load((tmp_path / name / str(agent) / "000020.yaml").read_text()) for name in ("apart", "listed")
+        )
+        bodies = apart.pop("agent_bodies")
+        assert set(bodies) == {21, 22} - {agent} and not {21, 22} & set(apart["vehicles"])
+        assert listed["vehicles"] == apart["vehicles"] | bodies and "agent_bodies" not in listed
+        assert {key: value for key, value in listed.items() if key != "vehicles"} == {
+            key: value for key, value in apart.items() if key != "vehicles"
+        }
+    one, other = (Opv2vRecording(tmp_path / name).snapshot(name, 0) for name in ("apart", "listed"))
+    assert_same(replace(one, scenario="listed"), other)
+
+
+def test_damaged_bodies_of_agents_are_named(tmp_path: Path) -> None:
+    Opv2vWriter(tmp_path / "drive").write(drive_frame(agents=(1, 21)))
+    edit(tmp_path / "drive" / "1" / "000020.yaml", lambda c: c.update(agent_bodies=[1]))
+    with pytest.raises(RecordingError, match="a mapping at 'agent_bodies'"):
+        Opv2vRecording(tmp_path / "drive").snapshot("drive", 0)
+    edit(tmp_path / "drive" / "1" / "000020.yaml", lambda c: c.update(agent_bodies={21: {"angle": [0, 0, 0]}}))
+    with pytest.raises(RecordingError, match=r"'agent_bodies.21.location' with 3 numbers"):
+        Opv2vRecording(tmp_path / "drive").snapshot("drive", 0)
 
 
 def test_the_true_pose_and_the_reported_pose_are_written(tmp_path: Path) -> None:

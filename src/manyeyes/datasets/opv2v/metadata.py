@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,10 +20,12 @@ from manyeyes.datatypes import LABELS, RecordingError
 from manyeyes.datatypes.errors import shorten
 
 KMH_PER_MPS = 3.6
+AGENT_BODIES = "agent_bodies"
+"""Key of the agents' own bodies in files of :class:`Opv2vWriter`: OPV2V lists them nowhere, and other readers skip the key."""
 PROTOCOL = "data_protocol.yaml"
 """Name of the file in a scenario's folder that states how it was simulated."""
 # Columns of a kept array: row 0 is the agent, the rows below are the objects that it lists.
-_COLUMNS, _CACHE_KIND = 16, "opv2v2"
+_COLUMNS, _CACHE_KIND = 16, "opv2v3"
 # Published matrices are rounded; a mirrored or sheared one is farther off than this.
 _NOT_A_ROTATION = 0.02
 _MAX_ID = 2**53
@@ -36,6 +38,8 @@ _BUSES = ("fusorosa", "bus")
 @dataclass(frozen=True)
 class AgentRecord:
     """Content of one yaml in its own units and axes: metres, degrees and km/h, in OPV2V in CARLA's left-handed world.
+
+    Objects are those of ``vehicles``, then those of AGENT_BODIES.
 
     lidar_pose, ego_pose, predicted_pose: [x, y, z, roll, yaw, pitch]; ego_pose is NaN where the file has none. id, label: (N,) of
     the listed objects, label -1 where the stated type is none of LABELS; location, center, extent, angle ([roll, yaw, pitch]):
@@ -124,16 +128,18 @@ def _parse(path: Path) -> np.ndarray:
     if vehicles is content:
         remedy = f"{_REMEDY}, or write 'vehicles: {{}}' where nothing is labelled"
         raise RecordingError(f"{path}: expected the key 'vehicles', found none; {remedy}.")
-    if not isinstance(vehicles, Mapping | None):
-        raise RecordingError(f"{path}: expected a mapping at 'vehicles', found {shorten(vehicles)}; {_REMEDY}.")
-    rows = np.zeros((1 + len(vehicles or ()), _COLUMNS))
+    listed = [
+        (f"{name}.{key}", key, vehicle)
+        for name, mapping in (("vehicles", vehicles), (AGENT_BODIES, content.get(AGENT_BODIES)))
+        for key, vehicle in _entries(path, name, mapping)
+    ]
+    rows = np.zeros((1 + len(listed), _COLUMNS))
     rows[0, :6], rows[0, 14] = _pose(path, content, "lidar_pose")
     rows[0, 6:12] = _pose(path, content, "true_ego_pos")[0] if content.get("true_ego_pos") is not None else np.nan
     rows[0, 12] = _numbers(path, content, "ego_speed", 1)[0] if content.get("ego_speed") is not None else 0.0
     rows[0, 13] = bool(content.get("RSU", _below_zero(path.parent.name)))
     has_links = has_named_types = False
-    for row, (key, vehicle) in zip(rows[1:], (vehicles or {}).items()):
-        yaml_path = f"vehicles.{key}"
+    for row, (yaml_path, key, vehicle) in zip(rows[1:], listed):
         if not isinstance(vehicle, Mapping):
             raise RecordingError(f"{path}: expected a mapping at '{yaml_path}', found {shorten(vehicle)}; {_REMEDY}.")
         try:
@@ -153,6 +159,13 @@ def _parse(path: Path) -> np.ndarray:
         has_named_types |= str(vehicle.get("obj_type", ""))[:1].isupper()
     rows[0, 15] = has_links + 2 * has_named_types
     return rows
+
+
+def _entries(path: Path, name: str, mapping: object) -> Sequence[tuple[Any, Any]]:
+    """Return keys and values of a mapping of objects, which may be empty."""
+    if not isinstance(mapping, Mapping | None):
+        raise RecordingError(f"{path}: expected a mapping at '{name}', found {shorten(mapping)}; {_REMEDY}.")
+    return tuple(mapping.items()) if mapping else ()
 
 
 def _link(path: Path, vehicle: Mapping[Any, Any], yaml_path: str) -> int:
@@ -238,11 +251,20 @@ def _label(vehicle: Mapping[Any, Any], size: np.ndarray) -> int:
 
 
 def write_record(
-    path: Path, record: AgentRecord, predicted_pose: Sequence[float], cameras: Mapping[str, Any] | None = None
+    path: Path,
+    record: AgentRecord,
+    predicted_pose: Sequence[float],
+    cameras: Mapping[str, Any] | None = None,
+    apart: Collection[int] = (),
 ) -> None:
-    """Write one agent's yaml; predicted_pose: the agent's estimate of its own pose on the road; cameras: their entries.
+    """Write one agent's yaml. The text is formed by hand, because PyYAML takes ten times as long as the rest of a frame.
 
-    The text is formed by hand, because PyYAML takes ten times as long as the rest of a frame.
+    Args:
+        path: of the file.
+        record: its content.
+        predicted_pose: the agent's estimate of its own pose on the road.
+        cameras: their entries.
+        apart: ids of the objects that stand under AGENT_BODIES, not under ``vehicles``.
     """
     lines = [f"RSU: {str(record.is_infrastructure).lower()}", f"ego_speed: {_number(record.speed_kmh)}"]
     for key, camera in (cameras or {}).items():
@@ -254,14 +276,22 @@ def write_record(
         lines += _list(key, pose, "")
     for key, pose in (("predicted_ego_pos", predicted_pose), ("true_ego_pos", record.ego_pose)):
         lines += _list(key, pose, "")
-    lines.append("vehicles:" if len(record.id) else "vehicles: {}")
-    for i, key in enumerate(record.id.tolist()):
-        lines.append(f"  {key}:")
+    is_apart = np.isin(record.id, np.array(sorted(apart), np.int64))
+    lines += _objects("vehicles", record, np.flatnonzero(~is_apart)) or ["vehicles: {}"]
+    lines += _objects(AGENT_BODIES, record, np.flatnonzero(is_apart))
+    atomic_write_text(path, "\n".join(lines) + "\n", durable=False)
+
+
+def _objects(key: str, record: AgentRecord, rows: np.ndarray) -> list[str]:
+    """Return the lines of a mapping of objects, none without objects."""
+    lines = [f"{key}:"] if len(rows) else []
+    for i in rows.tolist():
+        lines.append(f"  {int(record.id[i])}:")
         for name in ("angle", "center", "extent", "location"):
             lines += _list(name, getattr(record, name)[i].tolist(), "    ")
         lines.append(f"    obj_type: {LABELS[int(record.label[i])]}")
         lines.append(f"    speed: {_number(float(record.speed[i]))}")
-    atomic_write_text(path, "\n".join(lines) + "\n", durable=False)
+    return lines
 
 
 def _list(key: str, values: Sequence[float], indent: str) -> list[str]:

@@ -26,14 +26,24 @@ class Opv2vWriter:
     prior pose. The true pose goes to ``lidar_pose``, the prior one to ``predicted_ego_pos``, which the reader does not
     use. Snapshots come back with agents in string order of their ids, infrastructure (negative ids) last, and boxes in
     the order of ids.
+
+    OPV2V lists no agent's body as a vehicle (OpenCOOD, issue 141), so that readers of OPV2V count none as truth. The bodies that an
+    agent has seen are therefore written beside its ``vehicles``, under ``agent_bodies``, which :class:`Opv2vRecording` reads and
+    others skip. lists_agents: write them under ``vehicles``, as V2XSet does.
     """
 
     def __init__(
-        self, folder: Path | str, fixed_delta_s: float = 0.05, digits: int = 6, has_float_intensity: bool = False
+        self,
+        folder: Path | str,
+        fixed_delta_s: float = 0.05,
+        digits: int = 6,
+        has_float_intensity: bool = False,
+        lists_agents: bool = False,
     ) -> None:
         self.folder = Path(folder)
         self._fixed_delta_s = fixed_delta_s
         self._digits = digits
+        self._lists_agents = lists_agents
         self._write_cloud = write_float_pcd if has_float_intensity else write_pcd
         self.folder.mkdir(parents=True, exist_ok=True)
 
@@ -59,7 +69,8 @@ class Opv2vWriter:
                 write_png(image_path(folder, stem, number), image.rgb)
                 cameras |= camera_yaml(number, image.camera, *true_pose)
             # Last, so that a yaml without its cloud never comes of an interrupted run.
-            write_record(folder / f"{stem}.yaml", record, carla_from_transform(frame.world_from_agent), cameras)
+            apart = () if self._lists_agents else [other.agent_id for other in snapshot.frames]
+            write_record(folder / f"{stem}.yaml", record, carla_from_transform(frame.world_from_agent), cameras, apart)
 
     def close(self, protocol: Mapping[str, Any]) -> None:
         """Write data_protocol.yaml; ``history_frames`` is the number of first frames that are not evaluated."""
