@@ -17,7 +17,14 @@ import pytest
 REPOSITORY = Path(__file__).resolve().parents[1]
 SOURCE = REPOSITORY / "src" / "manyeyes"
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
-MODULES = {"PIL": "pillow", "yaml": "pyyaml", "sumo": "eclipse-sumo", "small_gicp": "small-gicp", "llvmlite": "numba"}
+MODULES = {
+    "PIL": "pillow",
+    "yaml": "pyyaml",
+    "sumo": "eclipse-sumo",
+    "small_gicp": "small-gicp",
+    "zenoh": "eclipse-zenoh",
+    "llvmlite": "numba",
+}
 """Modules whose package on the index has another name; numba brings llvmlite of its own version."""
 
 
@@ -115,6 +122,7 @@ def test_doctor_looks_for_what_the_extras_install(capsys: pytest.CaptureFixture[
 def test_the_package_imports_no_extra_before_it_is_needed() -> None:
     code = (
         "import sys, manyeyes.cli.main, manyeyes.agents.agent; "
-        "sys.exit(any(m in sys.modules for m in ('shapely', 'pyarrow', 'PIL', 'matplotlib', 'libsumo')))"
+        "optional = 'shapely pyarrow PIL matplotlib libsumo cryptography zenoh mcap'.split(); "
+        "sys.exit(any(m in sys.modules for m in optional))"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

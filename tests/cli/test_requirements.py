@@ -94,6 +94,13 @@ CASES = [
     ),
     ("map export m a.parquet", "shapely", "map export with file *.parquet needs the 'map' extra"),
     ("map view m --out m.png", "matplotlib", "map view with out *.png needs the 'view' extra"),
+    ("keys anchor", "cryptography", "keys anchor needs the 'live' extra: pip install 'manyeyes[live]'"),
+    ("keys issue a", "cryptography", "keys issue needs the 'live' extra"),
+    ("keys pool --out p", "cryptography", "keys pool needs the 'live' extra"),
+    ("keys verify c", "cryptography", "keys verify needs the 'live' extra"),
+    ("keys revoke c", "cryptography", "keys revoke needs the 'live' extra"),
+    ("keys trust t", "cryptography", "keys trust needs the 'live' extra"),
+    ("keys demo", "cryptography", "keys demo needs the 'live' extra"),
     ("study robustness --data d", "matplotlib", "study robustness needs the 'view' extra"),
     ("study qualitative --data d", "PIL", "study qualitative needs the 'view' extra"),
     (

@@ -8,14 +8,17 @@ import tracemalloc
 import zlib
 from collections.abc import Callable
 from dataclasses import fields, replace
+from functools import partial
+from typing import get_args
 
 import numpy as np
 import pytest
 import torch
 
 from manyeyes.comms import payloads
-from manyeyes.comms.drop_counts import DropCounts
+from manyeyes.comms.drop_counts import AuthenticationRefusal, DropCounts
 from manyeyes.comms.inbox import Inbox
+from manyeyes.comms.network import UNKNOWN_ORIGIN, Origin
 from manyeyes.comms.receiver_limits import ReceiverLimits
 from manyeyes.comms.token_format import TokenFormat
 from manyeyes.comms.wire import HEADER_BYTES, EncodedBody, encode, make_packets
@@ -66,11 +69,23 @@ def empty(agent: int = 1, stamp: int = NOW) -> bytes:
     return encode(header(agent, stamp))[0]
 
 
-def filled(packets: list[bytes], arrival_ns: int | None = NOW, **options) -> Inbox:
+def filled(packets: list[bytes], arrival_ns: int | None = NOW, origin: Origin = UNKNOWN_ORIGIN, **options) -> Inbox:
     inbox = Inbox(**options)
     for packet in packets:
-        inbox.push(packet, arrival_ns)
+        inbox.push(packet, arrival_ns, origin)
     return inbox
+
+
+class Refusal:
+    """An authenticator that refuses everything for one reason, and keeps the numbers of the packets."""
+
+    def __init__(self, reason: AuthenticationRefusal) -> None:
+        self.reason: AuthenticationRefusal = reason
+        self.numbers: list[int] = []
+
+    def check(self, envelope, signed, arrival_ns, origin) -> AuthenticationRefusal | None:
+        self.numbers.append(envelope.number)
+        return self.reason
 
 
 def packets_of(message: Message, mtu: int = 400) -> list[bytes]:
@@ -99,7 +114,8 @@ CASES: dict[str, Callable[[], Inbox]] = {
     "implausible": lambda: filled([changed(empty(), 20, b"\0\0\0\0\0\x80")]),
     "future": lambda: filled([empty(stamp=NOW + LIMITS.max_skew_ns + 1)]),
     "expired": lambda: filled([empty(stamp=NOW - LIMITS.max_age_ns - 1)]),
-    "unauthenticated": lambda: filled([empty()], authenticate=lambda envelope: envelope.header.agent_id != 1),
+    "tile": lambda: filled([empty()], origin=Origin(tile="g2_0")),
+    **{reason: partial(filled, [empty()], authenticator=Refusal(reason)) for reason in get_args(AuthenticationRefusal)},
     "rate": lambda: filled([empty(), *with_objects()], limits=replace(LIMITS, max_instant_packets=1)),
     "wrong_model": lambda: filled([changed(with_tokens()[0], 56, b"model-02")], token_format=FORMAT),
     "grid": lambda: filled(with_tokens(grid=replace(GRID, stride=4)), token_format=FORMAT),
@@ -209,9 +225,9 @@ def test_a_packet_that_is_refused_uses_nothing_of_the_bounds() -> None:
 
 
 def test_an_authentic_packet_alone_changes_state() -> None:
-    seen = []
-    inbox = filled([*with_objects(), empty()], authenticate=lambda envelope: bool(seen.append(envelope.number)))
-    assert seen == [0, 0] and inbox.messages() == ()
+    refusal = Refusal("forged")
+    inbox = filled([*with_objects(), empty()], authenticator=refusal)
+    assert refusal.numbers == [0, 0] and inbox.messages() == ()
 
 
 def stamps(inbox: Inbox) -> list[tuple[int, int]]:

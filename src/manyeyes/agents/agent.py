@@ -37,7 +37,9 @@ from manyeyes.agents.token_codec import (
     unpack_tokens,
 )
 from manyeyes.comms import wire
+from manyeyes.comms.admission import Authenticator
 from manyeyes.comms.agent_body import count_agent_body_bytes
+from manyeyes.comms.envelope import UNSIGNED, EnvelopeSize
 from manyeyes.comms.inbox import Inbox, ReceivedMessage, Rejection
 from manyeyes.comms.receiver_limits import ReceiverLimits
 from manyeyes.comms.token_selection import SelectedTokens, select_for_packets
@@ -123,31 +125,43 @@ class Agent:
             require_codebook(detector)
 
     def share(
-        self, frame: AgentFrame, budget_bytes: int | None = None, requests: Sequence[Message] = ()
+        self,
+        frame: AgentFrame,
+        budget_bytes: int | None = None,
+        requests: Sequence[Message] = (),
+        envelope: EnvelopeSize = UNSIGNED,
     ) -> list[bytes]:
         """Return packets of this frame, most important first; an empty list if there is nothing to send.
 
         budget_bytes: a limit below the agent's own, for a shared channel. A message with tokens never exceeds it, even if nothing
         is sent; objects, points and the map are not limited, but reduce the bytes left for tokens. requests: received messages;
-        those with a request map weight the tokens by the sender's lack of confidence there.
+        those with a request map weight the tokens by the sender's lack of confidence there. envelope: bytes that a signature adds
+        to the packets before they are sent: packets leave room for it, and the budget includes it.
         """
         frame = self.perception_cache.level(frame).levelled
         budget = min((b for b in (self.budget_bytes, budget_bytes) if b is not None), default=None)
         message = self._compose(frame, requests)
         if message is None:
             return []
-        bodies = wire.encode_other_sections(message)
+        mtu = wire.DEFAULT_MTU - envelope.max_bytes
+        bodies = wire.encode_other_sections(message, mtu)
         if message.tokens is None:
             return wire.make_packets(message, bodies)
-        left = None if budget is None else budget - wire.count_bytes(bodies, message.body)
-        kept, selected = self._select(message, message.tokens, left)
+        budget = None if budget is None else budget - envelope.message_bytes
+        left = None if budget is None else budget - wire.count_bytes(bodies, message.body, envelope.packet_bytes)
+        kept, selected = self._select(message, message.tokens, left, envelope)
         encoded = replace(message, tokens=selected.tokens, token_score=selected.score)
         bodies += wire.encode_tokens(
-            encoded, token_encoding=self.token_encoding, tables=self.token_format.tables, counts=selected.counts
+            encoded,
+            token_encoding=self.token_encoding,
+            mtu=mtu,
+            tables=self.token_format.tables,
+            counts=selected.counts,
         )
         packets = wire.make_packets(message, bodies)
         self.strategy.record_sent(self.perception_cache, frame, kept)
-        return [] if budget is not None and sum(map(len, packets)) > budget else packets
+        num_bytes = sum(len(packet) + envelope.packet_bytes for packet in packets)
+        return [] if budget is not None and num_bytes > budget else packets
 
     def _compose(self, frame: AgentFrame, requests: Sequence[Message]) -> Message | None:
         """Return the message of the strategy, with the local map, descriptors and request map that the agent adds."""
@@ -163,7 +177,9 @@ class Agent:
             message = replace(message, request=make_request_map(self.perception_cache, frame))
         return message
 
-    def _select(self, message: Message, tokens: SparseBev, budget_bytes: int | None) -> tuple[Message, SelectedTokens]:
+    def _select(
+        self, message: Message, tokens: SparseBev, budget_bytes: int | None, envelope: EnvelopeSize
+    ) -> tuple[Message, SelectedTokens]:
         """Return the message with the tokens that fit into a budget, as the detector made them, and them as they are encoded."""
         detector = self.perception_cache.detector
         packed = pack_tokens(tokens, detector)
@@ -172,16 +188,18 @@ class Agent:
         is_coded, tables = self.token_encoding == "codebook", self.token_format.tables
         encoded = quantise_tokens(packed, detector) if is_coded else packed
         score = torch.ones(len(tokens.sites)) if message.token_score is None else message.token_score
-        mtu = wire.DEFAULT_MTU - count_agent_body_bytes(message.body)
-        selected = select_for_packets(encoded, score, budget_bytes, self.token_encoding, mtu, tables)
+        mtu = wire.DEFAULT_MTU - envelope.max_bytes - count_agent_body_bytes(message.body)
+        selected = select_for_packets(
+            encoded, score, budget_bytes, self.token_encoding, mtu, tables, envelope.packet_bytes
+        )
         if selected.tokens is not encoded:
             tokens = tokens.keep(torch.isin(tokens.sites.key, selected.tokens.sites.key))
         return replace(message, tokens=tokens, token_score=selected.score), selected
 
-    def inbox(self, expire_ns: int | None = None) -> Inbox:
-        """Return an inbox that accepts only tokens that this agent can fuse."""
+    def inbox(self, expire_ns: int | None = None, authenticator: Authenticator | None = None) -> Inbox:
+        """Return an inbox that accepts only tokens that this agent can fuse, from senders that the authenticator accepts."""
         limits = self.limits if expire_ns is None else replace(self.limits, max_age_ns=expire_ns)
-        return Inbox(token_format=self.token_format, limits=limits)
+        return Inbox(token_format=self.token_format, limits=limits, authenticator=authenticator)
 
     def perceive(self, frame: AgentFrame, inbox: Inbox | Iterable[bytes] = (), now_ns: int | None = None) -> Perception:
         """Return boxes around the agent from its own frame and from the messages received so far.

@@ -27,6 +27,7 @@ COMMANDS = {
     "view": "draw a frame of a recording, or animate a drive",
     "pose": "evaluate pose correction from detected objects: prior and corrected poses",
     "map": "one map from many drives: build, simulate, fuse, evaluate, diff, export, view, import, retract",
+    "keys": "keys and certificates of agents on a network: make, issue, verify, revoke",
     "study": "reproduce a table or figure: robustness, bandwidth, pose noise, map fusion, ...",
     "doctor": "print what a bug report needs",
 }
@@ -41,6 +42,16 @@ COMMAND_GROUPS = {
         "diff": "list what changed from one map to another",
         "export": "export a map: GeoJSON, GeoPackage, Lanelet2, Argoverse 2, nuScenes, PMTiles",
         "view": "draw a map as a web page (.html) that needs no internet, or as an image (.png)",
+    },
+    "keys": {
+        "anchor": "make an anchor, the key that all certificates are traced to, and a trust file",
+        "issue": "issue a certificate of an agent, or of an issuer",
+        "pool": "issue a pool of pseudonyms of one agent",
+        "show": "print what a certificate states",
+        "verify": "verify that a trust file admits a certificate now",
+        "revoke": "revoke a certificate in a trust file",
+        "trust": "print the anchors, issuers and revocations of a trust file",
+        "demo": "make a whole federation for tests: anchor, issuer, trust file, agents",
     },
     "study": {name: study.summary for name, study in STUDIES.items()},
 }

@@ -21,6 +21,7 @@ EXTRAS = {
     "icp": ("small_gicp",),
     "ros": ("rosbags",),
     "train": ("tensorboard", "matplotlib", "PIL"),
+    "live": ("cryptography", "zenoh", "mcap"),
 }
 """Modules that each extra installs."""
 
@@ -74,6 +75,7 @@ _EXECUTORS = (
     Requirement("ray", EXTRAS["ray"]).when("executor", "ray"),
 )
 _TENSORBOARD = Requirement("train", EXTRAS["train"]).when("compute.tensorboard", "True")
+_CRYPTOGRAPHY = Requirement("live", ("cryptography",))
 _GICP = Requirement("icp", EXTRAS["icp"]).when("correctors", "gicp")
 
 REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
@@ -109,6 +111,14 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
         _GEOPACKAGE.when("file", "*.gpkg", "*.pmtiles"),
     ),
     "map view": (_ARROW, _SHAPELY, _MATPLOTLIB.when("out", "*.png")),
+    "keys anchor": (_CRYPTOGRAPHY,),
+    "keys issue": (_CRYPTOGRAPHY,),
+    "keys pool": (_CRYPTOGRAPHY,),
+    "keys show": (),
+    "keys verify": (_CRYPTOGRAPHY,),
+    "keys revoke": (_CRYPTOGRAPHY,),
+    "keys trust": (_CRYPTOGRAPHY,),
+    "keys demo": (_CRYPTOGRAPHY,),
     "study robustness": (_MATPLOTLIB,),
     "study bandwidth": (_MATPLOTLIB,),
     "study shared-bandwidth": (_MATPLOTLIB,),

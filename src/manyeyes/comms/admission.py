@@ -8,33 +8,43 @@ messages are checked with each packet that is added, before it is stored. Bounds
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 
 from manyeyes.comms import payloads
-from manyeyes.comms.drop_counts import DropReason
+from manyeyes.comms.drop_counts import AuthenticationRefusal, DropReason
 from manyeyes.comms.entropy import CodeTables
+from manyeyes.comms.envelope import SignedPacket, is_signed, split_signed
 from manyeyes.comms.map_payload import UNIT_M, ElementRows
+from manyeyes.comms.network import UNKNOWN_ORIGIN, Origin
 from manyeyes.comms.payloads import ObjectRows, TokenRows
 from manyeyes.comms.receiver_limits import ReceiverLimits
+from manyeyes.comms.tiles import Tile
 from manyeyes.comms.token_format import TokenFormat
 from manyeyes.comms.wire import Envelope, Fragment, open_packet, read_fragment
 from manyeyes.datatypes import BevGrid
 from manyeyes.datatypes.message import RequestMap
 
-HeaderCheck = Callable[[Envelope, int | None], DropReason | None]
-"""Why a packet is refused by its header and its time of arrival (ns); None accepts it."""
 ContentCheck = Callable[[Fragment], DropReason | None]
 """Why a packet is refused by its content; None accepts it."""
-Authenticate = Callable[[Envelope], bool]
-"""Whether a packet is authentic; called before the packet changes any state."""
+
+
+class Authenticator(Protocol):
+    """Check that a packet is from the agent that it names; called before the packet changes any state of the receiver."""
+
+    def check(
+        self, envelope: Envelope, signed: SignedPacket | None, arrival_ns: int | None, origin: Origin
+    ) -> AuthenticationRefusal | None:
+        """Return why a packet is refused; None accepts it. signed: the parts of a signed packet, None of an unsigned one."""
+        ...
 
 
 class Admission:
     """The checks of one receiver that need no state; those of a sender and of a message are in ``sender_table``.
 
     token_format: of the receiver's weights; None: only the fingerprint is compared, or nothing where that is None, too.
-    authenticate: None accepts all packets.
+    authenticator: None accepts all unsigned packets, and reads no signed ones.
     """
 
     def __init__(
@@ -42,16 +52,10 @@ class Admission:
         limits: ReceiverLimits,
         fingerprint: bytes | None = None,
         token_format: TokenFormat | None = None,
-        authenticate: Authenticate | None = None,
+        authenticator: Authenticator | None = None,
     ) -> None:
         self._limits, self._fingerprint, self._token_format = limits, fingerprint, token_format
-        self.header_checks: tuple[HeaderCheck, ...] = (self._check_time, self._check_claims)
-        if authenticate is not None:
-            self.header_checks = (
-                self._check_time,
-                lambda envelope, _: None if authenticate(envelope) else "unauthenticated",
-                self._check_claims,
-            )
+        self._authenticator = authenticator
         self.content_checks: dict[type, tuple[ContentCheck, ...]] = {
             TokenRows: (self._check_tokens if token_format is not None else self._check_fingerprint, self._check_grid),
             ObjectRows: (self._check_objects,),
@@ -59,18 +63,19 @@ class Admission:
             RequestMap: (self._check_grid,),
         }
 
-    def open(self, packet: bytes, arrival_ns: int | None) -> Envelope | DropReason:
+    def open(self, packet: bytes, arrival_ns: int | None, origin: Origin = UNKNOWN_ORIGIN) -> Envelope | DropReason:
         """Return the header of a packet, or why it is refused before its body is read; may raise PacketError."""
         # The length of any buffer, without a copy
         size = len(packet) if type(packet) is bytes else memoryview(packet).nbytes
         if size > self._limits.max_packet_bytes:
             return "oversize"
-        envelope = open_packet(packet)
-        for check in self.header_checks:
-            reason = check(envelope, arrival_ns)
-            if reason is not None:
-                return reason
-        return envelope
+        is_read = self._authenticator is not None and is_signed(packet)
+        signed = split_signed(packet) if is_read else None
+        envelope = open_packet(packet if signed is None else signed.packet)
+        reason = self._check_time(envelope, arrival_ns) or self._check_tile(envelope, origin)
+        if reason is None and self._authenticator is not None:
+            reason = self._authenticator.check(envelope, signed, arrival_ns, origin)
+        return reason or self._check_claims(envelope) or envelope
 
     def read(self, envelope: Envelope, tables: CodeTables | None) -> Fragment | DropReason:
         """Return a packet with its body, or why its content is refused; may raise PacketError."""
@@ -90,7 +95,13 @@ class Admission:
             return "future"
         return "expired" if age_ns > self._limits.max_age_ns else None
 
-    def _check_claims(self, envelope: Envelope, arrival_ns: int | None) -> DropReason | None:
+    def _check_tile(self, envelope: Envelope, origin: Origin) -> DropReason | None:
+        if not origin.tile:
+            return None
+        x, y = envelope.header.pose[:2]
+        return None if Tile.of_name(origin.tile).is_next_to(Tile.at(x, y)) else "tile"
+
+    def _check_claims(self, envelope: Envelope) -> DropReason | None:
         """Numbers that the reader of the body would allocate for."""
         if envelope.header.num_packets > self._limits.max_message_packets:
             return "message_size"

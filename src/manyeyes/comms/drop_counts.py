@@ -11,9 +11,11 @@ from manyeyes.comms.token_format import TokenRefusal
 
 ContentRefusal = Literal["cells", "objects", "points", "map_elements", "range"]
 SenderRefusal = Literal["rate", "message_size", "duplicate", "superseded", "empty", "full"]
-DropReason = (
-    Reason | TokenRefusal | ContentRefusal | SenderRefusal | Literal["oversize", "future", "expired", "unauthenticated"]
-)
+AuthenticationRefusal = Literal[
+    "unsigned", "unknown_signer", "certificate", "revoked", "identity", "replayed", "busy", "forged"
+]
+HeaderRefusal = Literal["oversize", "future", "expired", "tile"]
+DropReason = Reason | TokenRefusal | ContentRefusal | SenderRefusal | AuthenticationRefusal | HeaderRefusal
 
 
 @dataclass(frozen=True)
@@ -33,8 +35,20 @@ class DropCounts:
     # Captured more than max_skew_ns after its arrival, or more than max_age_ns before it
     future: int = 0
     expired: int = 0
-    # Refused by the receiver's authentication
-    unauthenticated: int = 0
+    # The stated position is not in the tile that the packet was sent in, nor next to it
+    tile: int = 0
+    # Authentication (``runtime.authentication``): no signature where one is needed; no certificate of the signer yet
+    unsigned: int = 0
+    unknown_signer: int = 0
+    # A certificate that is invalid or expired, of an unknown issuer, or without the right to this content or place; a revoked one
+    certificate: int = 0
+    revoked: int = 0
+    # The agent id is not that of the certificate, or is in use on another link
+    identity: int = 0
+    # Received before; beyond the number of signatures that are verified at one instant; a wrong signature
+    replayed: int = 0
+    busy: int = 0
+    forged: int = 0
     # Too many packets or bytes of this sender within instant_ns
     rate: int = 0
     # Without any section, while the sender's last message has content

@@ -7,9 +7,10 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Literal
 
-from manyeyes.comms.admission import Admission, Authenticate
+from manyeyes.comms.admission import Admission, Authenticator
 from manyeyes.comms.drop_counts import DropCounts, DropReason
 from manyeyes.comms.entropy import CodeTables
+from manyeyes.comms.network import UNKNOWN_ORIGIN, Origin
 from manyeyes.comms.primitives import PacketError
 from manyeyes.comms.receiver_limits import ReceiverLimits
 from manyeyes.comms.sender_table import SenderTable
@@ -78,7 +79,8 @@ class Inbox:
     fingerprint: tokens of other weights are refused, other sections of the same message are not; None takes all. tables: of the
     codebook of these weights; without them coded tokens cannot be read and are refused as of other weights. token_format: refuses,
     beyond the fingerprint, tokens of another grid, width or range, and holds the tables; an agent's own inbox has it
-    (``Agent.inbox``). limits: bounds of all checks. authenticate: whether a packet is authentic; None accepts all.
+    (``Agent.inbox``). limits: bounds of all checks. authenticator: which packets are authentic; None accepts all unsigned
+    ones, and reads no signed ones.
 
     Times are those of the receiver's clock: without arrival_ns and now_ns no stamp is checked against it.
     """
@@ -89,11 +91,11 @@ class Inbox:
         tables: CodeTables | None = None,
         token_format: TokenFormat | None = None,
         limits: ReceiverLimits | None = None,
-        authenticate: Authenticate | None = None,
+        authenticator: Authenticator | None = None,
     ) -> None:
         self.limits = limits or ReceiverLimits()
         self._tables = tables if token_format is None else token_format.tables
-        self._admission = Admission(self.limits, fingerprint, token_format, authenticate)
+        self._admission = Admission(self.limits, fingerprint, token_format, authenticator)
         self._senders = SenderTable(self.limits)
         self._dropped = Counter[DropReason]()
         self._rejections: dict[int, Rejection] = {}
@@ -103,10 +105,10 @@ class Inbox:
         """Packets not taken so far, by reason."""
         return DropCounts(**self._dropped)
 
-    def push(self, packet: bytes, arrival_ns: int | None = None) -> None:
-        """Take one packet; whatever is wrong with it is counted and never raised."""
+    def push(self, packet: bytes, arrival_ns: int | None = None, origin: Origin = UNKNOWN_ORIGIN) -> None:
+        """Take one packet; whatever is wrong with it is counted and never raised. origin: of the network that it came from."""
         try:
-            refusal = self._take(packet, arrival_ns)
+            refusal = self._take(packet, arrival_ns, origin)
         except PacketError as error:
             refusal = error.reason
         if refusal is not None:
@@ -138,9 +140,9 @@ class Inbox:
         """Return the newest message of each agent, as far as it came, by agent id."""
         return tuple(reception.message for reception in self.received_messages(now_ns))
 
-    def _take(self, packet: bytes, arrival_ns: int | None) -> DropReason | None:
+    def _take(self, packet: bytes, arrival_ns: int | None, origin: Origin) -> DropReason | None:
         """Take a packet that passes all checks; the reason of the first that it does not pass."""
-        envelope = self._admission.open(packet, arrival_ns)
+        envelope = self._admission.open(packet, arrival_ns, origin)
         if isinstance(envelope, str):
             return envelope
         agent_id = envelope.header.agent_id

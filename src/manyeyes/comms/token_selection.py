@@ -30,16 +30,20 @@ def select_for_packets(
     token_encoding: TokenEncoding = "float16",
     mtu: int = DEFAULT_MTU,
     tables: CodeTables | None = None,
+    envelope_bytes: int = 0,
 ) -> SelectedTokens:
     """Return the cells of highest score (N,), ties by key, whose packets together have at most budget_bytes; None is no limit.
 
     Header, cell indices, scales and checksums are counted, so that the packets that ``wire.encode_tokens`` makes of the result
     never exceed the budget. A smaller budget keeps a subset. A budget that holds no cell keeps none: then the section is left
-    out of the message (an empty section would still cost its header). Source: CoSTr Eq. 13 with real bytes.
+    out of the message (an empty section would still cost its header). envelope_bytes: added to each packet by its signature; the
+    budget includes them, mtu does not. Source: CoSTr Eq. 13 with real bytes.
     """
     token_codec = TokenCodec(token_encoding, tables)
     order = token_order(bev, score)
-    counts = count_cells_per_packet(bev, order, token_codec, mtu - HEADER_BYTES, HEADER_BYTES, budget_bytes)
+    counts = count_cells_per_packet(
+        bev, order, token_codec, mtu - HEADER_BYTES, HEADER_BYTES + envelope_bytes, budget_bytes
+    )
     kept = sum(counts)
     if kept == len(order):
         return SelectedTokens(bev, score, tuple(counts))

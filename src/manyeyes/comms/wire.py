@@ -234,9 +234,10 @@ def _body_capacity(mtu: int, message: Message) -> int:
     return mtu - header_bytes
 
 
-def count_bytes(bodies: Iterable[EncodedBody], agent_body: AgentBody | None = None) -> int:
-    """Return bytes of the packets of these bodies, and of the body of their agent."""
-    return sum(HEADER_BYTES + len(body.content) for body in bodies) + count_agent_body_bytes(agent_body)
+def count_bytes(bodies: Iterable[EncodedBody], agent_body: AgentBody | None = None, envelope_bytes: int = 0) -> int:
+    """Return bytes of the packets of these bodies, each in an envelope of envelope_bytes, and of the body of their agent."""
+    header_bytes = HEADER_BYTES + envelope_bytes
+    return sum(header_bytes + len(body.content) for body in bodies) + count_agent_body_bytes(agent_body)
 
 
 def make_packets(message: Message, bodies: Sequence[EncodedBody]) -> list[bytes]:
