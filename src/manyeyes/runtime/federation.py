@@ -115,7 +115,7 @@ def make_demo_federation(folder: Path, agent_ids: Collection[int], lifetime_min:
     """Make an anchor, an issuer, and an agent for each id, with all rights of senders; return the trust file."""
     anchor = make_anchor(folder, "demo", 30)
     issuer = make_issuer(folder / "issuer", anchor.key, anchor.trust, 7)
-    rights: frozenset[Right] = SENDER_RIGHTS | {"infrastructure"}
+    rights = frozenset[Right]((*SENDER_RIGHTS, "infrastructure"))
     for agent_id in agent_ids:
         stem = folder / f"agent-{agent_id}"
         make_agent(stem, Issuer(issuer.key, issuer.certificate.identifier), agent_id, rights, lifetime_min)

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Network by UDP multicast: one datagram a packet, to all agents around; nearest to a broadcast radio.
+
+Each tile (``comms.tiles``) of each network has a group in 239.0.0.0/8 by a hash of both names; agents join the groups of their tile
+and of the eight around it. A datagram is ``MU``, 8 bytes of that hash, the indices i, j of the tile (2 x i32, little-endian), and
+the packet: the groups of two tiles may coincide, their hashes do not.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import select
+import socket
+import struct
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from manyeyes.comms.link_rings import LinkRings
+from manyeyes.comms.network import Origin, ReceivedPacket
+from manyeyes.comms.tiles import Tile
+from manyeyes.datatypes import ConfigError
+
+DEFAULT_PORT = 17_448
+_MAGIC = b"MU"
+_HEADER = struct.Struct("<2s8s2i")
+_RECEIVE_BYTES = 1 << 20
+_POLL_S = 0.2
+
+
+@dataclass(frozen=True)
+class UdpConfig:
+    """network: name of the network. interface: address of the interface that is used; by default other machines see nothing.
+
+    ttl: number of routers that a datagram passes; 0 stays on this machine, 1 in the local network.
+    """
+
+    network: str = "default"
+    interface: str = "127.0.0.1"
+    port: int = DEFAULT_PORT
+    ttl: int = 0
+
+
+class UdpNetwork:
+    """UDP multicast of one agent. A thread moves datagrams to bounded buffers.
+
+    Raises:
+        ConfigError: the interface has no multicast, or the port is in use by a program that does not share it.
+    """
+
+    def __init__(self, config: UdpConfig, clock: Callable[[], int]) -> None:
+        self._config, self._rings = config, LinkRings(clock)
+        self._tile: Tile | None = None
+        self._joined: dict[str, int] = {}
+        self._address = socket.inet_aton(config.interface)
+        try:
+            self._receiver, self._sender = self._open()
+        except OSError as error:
+            raise ConfigError(f"UDP multicast on {config.interface}, port {config.port}: {error}.") from error
+        # With the port, the address of a packet of this agent.
+        self._own_port = self._sender.getsockname()[1]
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._receive, name="udp", daemon=True)
+        self._thread.start()
+
+    def _open(self) -> tuple[socket.socket, socket.socket]:
+        receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BYTES)
+        receiver.bind(("", self._config.port))
+        receiver.setblocking(False)
+        sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, self._address)
+        sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, self._config.ttl)
+        sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
+        sender.bind((self._config.interface, 0))
+        sender.setblocking(False)
+        return receiver, sender
+
+    @property
+    def overflows(self) -> int:
+        """Number of packets that gave way to newer ones of their link before they were polled."""
+        return self._rings.overflows
+
+    def send(self, packets: Sequence[bytes], position_xy: tuple[float, float]) -> None:
+        """Send each packet as a datagram to the group of the agent's tile."""
+        tile = self._move(position_xy)
+        group = self._group(tile)
+        header = _HEADER.pack(_MAGIC, self._scope(tile), tile.i, tile.j)
+        for packet in packets:
+            # A full buffer of the interface drops, as a radio does.
+            with contextlib.suppress(BlockingIOError, OSError):
+                self._sender.sendto(header + packet, (group, self._config.port))
+
+    def poll(self) -> list[ReceivedPacket]:
+        """Return what arrived since the last call."""
+        return self._rings.take()
+
+    def neighbours(self) -> frozenset[str]:
+        """Return the addresses that something came from within a second."""
+        return self._rings.links()
+
+    def move(self, position_xy: tuple[float, float]) -> None:
+        """Receive from the tiles around a position; sending does this too."""
+        self._move(position_xy)
+
+    def close(self) -> None:
+        """Stop the thread and close the sockets."""
+        self._stopped.set()
+        self._thread.join()
+        self._receiver.close()
+        self._sender.close()
+
+    def _move(self, position_xy: tuple[float, float]) -> Tile:
+        """Join the groups of the tiles around a position, and leave others."""
+        tile = Tile.at(*position_xy) if self._tile is None else self._tile.move_to(*position_xy)
+        if tile != self._tile:
+            self._tile = tile
+            wanted = {self._group(other) for other in tile.with_neighbours()}
+            for group in self._joined.keys() - wanted:
+                self._set_membership(socket.IP_DROP_MEMBERSHIP, group)
+                del self._joined[group]
+            for group in wanted - self._joined.keys():
+                self._set_membership(socket.IP_ADD_MEMBERSHIP, group)
+                self._joined[group] = 1
+        return tile
+
+    def _set_membership(self, option: int, group: str) -> None:
+        try:
+            self._receiver.setsockopt(socket.IPPROTO_IP, option, socket.inet_aton(group) + self._address)
+        except OSError as error:
+            raise ConfigError(f"Multicast group {group} on {self._config.interface}: {error}.") from error
+
+    def _receive(self) -> None:
+        while not self._stopped.is_set():
+            ready, _, _ = select.select([self._receiver], [], [], _POLL_S)
+            while ready and not self._stopped.is_set():
+                try:
+                    data, (host, port) = self._receiver.recvfrom(65_535)
+                except OSError:  # nothing is left
+                    break
+                self._put(data, host, port)
+
+    def _put(self, data: bytes, host: str, port: int) -> None:
+        """Store the packet of a datagram of this network and of a tile around, unless it is the agent's own."""
+        tile = self._tile
+        if len(data) < _HEADER.size or tile is None or (port == self._own_port and host == self._config.interface):
+            return
+        magic, scope, i, j = _HEADER.unpack_from(data)
+        sent_in = Tile(i, j)
+        if magic == _MAGIC and sent_in.is_next_to(tile) and scope == self._scope(sent_in):
+            self._rings.put(data[_HEADER.size :], Origin(f"{host}:{port}", sent_in.name))
+
+    def _scope(self, tile: Tile) -> bytes:
+        return hashlib.sha256(f"manyeyes/{self._config.network}/3/{tile.name}".encode()).digest()[:8]
+
+    def _group(self, tile: Tile) -> str:
+        scope = self._scope(tile)
+        return f"239.{scope[0]}.{scope[1]}.{scope[2]}"

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Network by zenoh (https://zenoh.io): peers that find each other by seeds and gossip, or by multicast.
+
+Keys are ``manyeyes/NETWORK/3/TILE/AGENT/msg``, and ``manyeyes/NETWORK/3/live/AGENT`` for the presence of an agent. Packets are sent
+best-effort and are dropped under congestion. The callback of a subscription only appends to a bounded buffer: a callback that works
+makes zenoh queue without a bound.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from manyeyes.comms.link_rings import MAX_PACKET_BYTES, LinkRings
+from manyeyes.comms.network import Origin, ReceivedPacket
+from manyeyes.comms.tiles import Tile
+from manyeyes.datatypes import ConfigError
+from manyeyes.datatypes.extras import import_extra
+
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+LEASE_MS = 1_000
+"""A process that does not answer for this long is gone."""
+MAX_SESSIONS = 128
+
+
+@dataclass(frozen=True)
+class ZenohConfig:
+    """network: its name. listen, connect: endpoints such as tcp/10.0.0.5:7447; port 0 is any. By default, this machine only.
+
+    multicast: find peers by multicast too. config_file: a zenoh configuration (JSON5) that is read first: TLS, access control.
+    """
+
+    network: str = "default"
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
+    connect: tuple[str, ...] = ()
+    multicast: bool = False
+    config_file: str | None = None
+
+
+class ZenohNetwork:
+    """zenoh session of one agent.
+
+    Raises:
+        ConfigError: an endpoint cannot be used, or a name has other characters than letters, digits, - and _.
+        MissingExtraError: zenoh is not installed.
+    """
+
+    def __init__(self, config: ZenohConfig, agent_id: int, clock: Callable[[], int]) -> None:
+        if not _NAME.fullmatch(config.network):
+            raise ConfigError(f"A network is named by letters, digits, - and _; got {config.network!r}.")
+        self._zenoh = import_extra("zenoh", "live", "The network zenoh")
+        self._prefix, self._agent_id = f"manyeyes/{config.network}/3", agent_id
+        self._rings = LinkRings(clock)
+        self._tile: Tile | None = None
+        self._subscriptions: dict[Tile, Any] = {}
+        self._publisher: Any = None
+        try:
+            self._session = self._zenoh.open(self._make_config(config))
+            self._token = self._session.liveliness().declare_token(f"{self._prefix}/live/{agent_id}")
+        except self._zenoh.ZError as error:
+            raise ConfigError(f"zenoh, listening on {', '.join(config.listen)}: {error}") from error
+
+    def _make_config(self, config: ZenohConfig) -> Any:
+        made = self._zenoh.Config.from_file(config.config_file) if config.config_file else self._zenoh.Config()
+        settings = {
+            "mode": "peer",
+            "listen/endpoints": list(config.listen),
+            "connect/endpoints": list(config.connect),
+            "scouting/multicast/enabled": config.multicast,
+            "scouting/gossip/enabled": True,
+            "transport/link/rx/max_message_size": MAX_PACKET_BYTES + 1,
+            "transport/link/tx/lease": LEASE_MS,
+            "transport/unicast/max_sessions": MAX_SESSIONS,
+            "transport/shared_memory/enabled": False,
+        }
+        for key, value in settings.items():
+            made.insert_json5(key, json.dumps(value))
+        return made
+
+    @property
+    def overflows(self) -> int:
+        """Number of packets that gave way to newer ones of their link before they were polled."""
+        return self._rings.overflows
+
+    def send(self, packets: Sequence[bytes], position_xy: tuple[float, float]) -> None:
+        """Publish packets under the key of the agent's tile."""
+        self._move(position_xy)
+        for packet in packets:
+            self._publisher.put(packet)
+
+    def poll(self) -> list[ReceivedPacket]:
+        """Return what arrived since the last call."""
+        return self._rings.take()
+
+    def neighbours(self) -> frozenset[str]:
+        """Return the ids in the keys that something came under within a second."""
+        return self._rings.links()
+
+    def present(self) -> frozenset[str]:
+        """Ask the network which agents are connected, whether they send or not."""
+        replies = self._session.liveliness().get(f"{self._prefix}/live/*", timeout=1.0)
+        keys = (str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
+        return frozenset(key.rpartition("/")[2] for key in keys) - {str(self._agent_id)}
+
+    def rename(self, agent_id: int) -> None:
+        """Go on under another id: keys change with the pseudonym."""
+        if agent_id != self._agent_id:
+            self._agent_id, self._tile = agent_id, None
+            self._token.undeclare()
+            self._token = self._session.liveliness().declare_token(f"{self._prefix}/live/{agent_id}")
+
+    def close(self) -> None:
+        """Undeclare everything and close the session."""
+        self._session.close()
+
+    def _move(self, position_xy: tuple[float, float]) -> None:
+        """Subscribe to the tiles around a position, and publish in its own."""
+        tile = Tile.at(*position_xy) if self._tile is None else self._tile.move_to(*position_xy)
+        if tile == self._tile:
+            return
+        self._tile, wanted = tile, tile.with_neighbours()
+        for other in self._subscriptions.keys() - wanted:
+            self._subscriptions.pop(other).undeclare()
+        for other in wanted - self._subscriptions.keys():
+            key = f"{self._prefix}/{other.name}/*/msg"
+            self._subscriptions[other] = self._session.declare_subscriber(key, self._receive)
+        if self._publisher is not None:
+            self._publisher.undeclare()
+        self._publisher = self._session.declare_publisher(
+            f"{self._prefix}/{tile.name}/{self._agent_id}/msg",
+            congestion_control=self._zenoh.CongestionControl.DROP,
+            priority=self._zenoh.Priority.REAL_TIME,
+            express=True,
+            reliability=self._zenoh.Reliability.BEST_EFFORT,
+        )
+
+    def _receive(self, sample: Any) -> None:
+        """Append a packet to the buffer of its link, nothing else."""
+        tile, agent, _ = str(sample.key_expr).split("/")[-3:]
+        if len(sample.payload) <= MAX_PACKET_BYTES and agent != str(self._agent_id):
+            self._rings.put(sample.payload.to_bytes(), Origin(agent, tile))
