@@ -109,7 +109,7 @@ def coded_claim(count: int) -> bytes:
 CASES: dict[str, Callable[[], Inbox]] = {
     "oversize": lambda: filled(with_objects(3), limits=replace(LIMITS, max_packet_bytes=68)),
     "garbage": lambda: filled([b"ME\x02" + bytes(20)]),
-    "version": lambda: filled([b"ME\x04" + bytes(90)]),
+    "version": lambda: filled([b"ME\x05" + bytes(90)]),
     "checksum": lambda: filled([empty()[:-1] + b"\0"]),
     "implausible": lambda: filled([changed(empty(), 20, b"\0\0\0\0\0\x80")]),
     "future": lambda: filled([empty(stamp=NOW + LIMITS.max_skew_ns + 1)]),

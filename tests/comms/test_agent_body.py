@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sender's own vehicle on the wire: nine bytes of the first packet, bounded, absent in version 2."""
+"""The sender's own vehicle on the wire: nine bytes of the first packet, bounded, optional in version 4."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_a_message_has_it_once_and_pays_nine_bytes() -> None:
     assert sum(map(len, with_body)) - sum(map(len, without)) == AGENT_BODY_BYTES == 9
     assert received(with_body).body == AgentBody.standing(1.42, -0.13, (4.9, 2.1, 1.8), math.radians(1.15))
     assert received(without).body is None
-    assert [packet[2] for packet in (*with_body, *without)] == [3] * len(with_body) + [2] * len(without)
+    assert [packet[2] for packet in (*with_body, *without)] == [4] * (len(with_body) + len(without))
     assert len(received(with_body).objects or ()) == 30
 
 
@@ -116,7 +116,7 @@ AT = wire.HEADER_BYTES - 4
         (AT + 6, b"\0", "implausible"),
         (AT + 8, b"\xfb", "implausible"),
         (2, b"\2", "garbage"),
-        (2, b"\4", "version"),
+        (2, b"\5", "version"),
         (4, b"\1\0", "garbage"),
         (3, b"\x82", "garbage"),
         (3, b"\x02", "garbage"),

@@ -207,7 +207,7 @@ def test_two_views_in_one_message_are_a_contradiction():
 
 
 def test_golden_bytes_of_map_elements():
-    """Kind 5 of version 2, byte for byte: if this fails, either undo the change or raise wire.VERSION."""
+    """Kind 5 since version 2, byte for byte: if this fails, either undo the change or raise wire.VERSION."""
     style = np.eye(len(STYLES))[[DASHED, DASHED]] * 0.8 + 0.05
     line, ring = [[1.0, -2.0], [11.0, -2.5]], [[4.0, -1.0], [6.0, -1.0], [6.0, 1.0]]
     made = MapElements.of([line, ring], [DIVIDER, CROSSING], [0.5, 0.75], 0.12, style)

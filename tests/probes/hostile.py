@@ -232,10 +232,13 @@ _OBJECT_FIELDS = tuple(
         ("x", 0, "h"),
         ("y", 2, "h"),
         ("yaw", 4, "h"),
-        *((name, 6 + n, "B") for n, name in enumerate(("length", "width", "score", "sigma xy", "sigma yaw", "label", "id"))),
-        ("velocity x", 13, "b"),
-        ("velocity y", 14, "b"),
-        ("descriptor", 15, "b"),
+        ("length", 6, "B"),
+        ("width", 7, "B"),
+        ("score", 8, "H"),
+        *((name, 10 + n, "B") for n, name in enumerate(("sigma xy", "sigma yaw", "label", "id"))),
+        ("velocity x", 14, "b"),
+        ("velocity y", 15, "b"),
+        ("descriptor", 16, "b"),
     )
 )  # fmt: skip
 _POINT_FIELDS = (*(Field(f"point {axis}", BODY_OFFSET + 2 * n, "h") for n, axis in enumerate("xyz")),)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Keypoint descriptors of objects in messages (FeaKM section 4.2.1).
 
-Positions, headings and sizes are sent as objects of a message, 13 bytes each; descriptors take one byte a channel (comms/wire.py).
+Positions, headings and sizes are sent as objects of a message, 14 bytes each; descriptors take one byte a channel (comms/wire.py).
 """
 
 from __future__ import annotations

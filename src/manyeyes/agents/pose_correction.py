@@ -5,7 +5,7 @@ No bytes are added: the landmarks of a sender are the boxes it sends, those prop
 its own vehicle, which other agents detect (``AgentFrame.body``). Boxes of an earlier timestamp are propagated by their velocity. A
 sender without a match is propagated from its last corrected pose: its current landmarks are matched with its earlier ones. Pairs of
 senders are matched too; a pose graph combines all matches and isolates inconsistent senders. A monitor reports senders whose prior
-poses have an offset or drift. With a FeaKM corrector, senders add descriptors of 32 bytes an object, and boxes of 13 bytes where
+poses have an offset or drift. With a FeaKM corrector, senders add descriptors of 32 bytes an object, and boxes of 14 bytes where
 they send none.
 """
 

@@ -36,10 +36,6 @@ NONE, TOKENS, OBJECTS, POINTS, REQUEST, ELEMENTS = range(6)
 _GRID = struct.Struct("<6hHB")
 _TOKENS = struct.Struct("<BHH")
 TOKENS_BYTES = _GRID.size + _TOKENS.size
-_OBJECT = np.dtype(
-    [("xy", "<i2", 2), ("yaw", "<i2"), ("size", "u1", 2), ("score", "u1")]
-    + [(name, "u1") for name in ("sigma_xy", "sigma_yaw", "label_flip", "id")]
-)
 _VELOCITY, _DESCRIPTOR = 1, 2
 _METRES_PER_S = 0.25
 _POINT = np.dtype([("xyz", "<i2", 3), ("intensity", "u1")])
@@ -101,11 +97,14 @@ def _centimetres(metres: NDArray[np.floating[Any]], what: str) -> NDArray[np.int
     return codes.astype(np.int16)
 
 
-@lru_cache(maxsize=4)
-def _object_type(flags: int) -> np.dtype[Any]:
-    """Return the row of an object, with what the flags of its body add."""
+@lru_cache(maxsize=8)
+def _object_type(flags: int, has_fine_scores: bool = True) -> np.dtype[Any]:
+    """Return the row of an object, with what the flags of its body add; has_fine_scores: not of versions 2 and 3."""
+    places = [("xy", "<i2", 2), ("yaw", "<i2"), ("size", "u1", 2), ("score", "<u2" if has_fine_scores else "u1")]
+    rest = [(name, "u1") for name in ("sigma_xy", "sigma_yaw", "label_flip", "id")]
     velocity = [("velocity", "i1", 2)] if flags & _VELOCITY else []
-    return np.dtype(_OBJECT.descr + velocity + ([("descriptor", "i1", DESCRIPTOR_DIM)] if flags & _DESCRIPTOR else []))
+    descriptor = [("descriptor", "i1", DESCRIPTOR_DIM)] if flags & _DESCRIPTOR else []
+    return np.dtype([*places, *rest, *velocity, *descriptor])
 
 
 def pack_object_bodies(boxes: Boxes, descriptors: Tensor | None, capacity: int) -> list[bytes]:
@@ -140,7 +139,7 @@ def pack_object_bodies(boxes: Boxes, descriptors: Tensor | None, capacity: int) 
     hundredths = np.rint(np.rad2deg(v[:, 6]) * 100)
     rows["yaw"] = np.mod(hundredths + 18000, 36000) - 18000
     rows["size"] = np.clip(np.rint(v[:, 3:5] * 10), 1, 255)
-    rows["score"] = np.rint(np.clip(v[:, 7], 0, 1) * 255)
+    rows["score"] = np.rint(np.clip(v[:, 7], 0, 1) * 65535)
     rows["sigma_xy"] = primitives.log_codes(v[:, 8], *_SIGMA_XY)
     rows["sigma_yaw"] = primitives.log_codes(v[:, 9], *_SIGMA_YAW)
     rows["label_flip"] = label | np.rint(np.clip(v[:, 10], 0, 1) * 31).astype(np.int64) << 3
@@ -348,15 +347,18 @@ def _values(features: Tensor, encoding: TokenEncoding, counts: list[int]) -> tup
     return rows.astype(_FEATURE_TYPES[encoding], copy=False).tobytes(), [b""] * len(counts)
 
 
-def read_body(kind: int, body: bytes, fingerprint: bytes, tables: CodeTables | None) -> Body:
+def read_body(
+    kind: int, body: bytes, fingerprint: bytes, tables: CodeTables | None, has_fine_scores: bool = True
+) -> Body:
     """Return the rows of a body, checked; whatever is wrong is a PacketError with a reason.
 
     tables: of the reader's weights; coded tokens can only be read by those that the packet's fingerprint names.
+    has_fine_scores: of objects, whose scores have two bytes; false of versions 2 and 3.
     """
     if kind == TOKENS:
         return _read_tokens(body, fingerprint, tables)
     if kind == OBJECTS:
-        return _read_objects(body)
+        return _read_objects(body, has_fine_scores)
     if kind == REQUEST:
         return _read_request(body)
     if kind == ELEMENTS:
@@ -379,10 +381,10 @@ def _rows(body: bytes, dtype: np.dtype[Any]) -> NDArray[Any]:
     return np.frombuffer(body, dtype)
 
 
-def _read_objects(body: bytes) -> ObjectRows:
+def _read_objects(body: bytes, has_fine_scores: bool) -> ObjectRows:
     if not body or body[0] & ~(_VELOCITY | _DESCRIPTOR):
         raise PacketError("garbage", "A body of objects begins with its flags, of which two are known.")
-    rows = _rows(body[1:], _object_type(body[0]))
+    rows = _rows(body[1:], _object_type(body[0], has_fine_scores))
     good = (rows["label_flip"] & 7 < len(LABELS)) & (rows["size"] > 0).all(-1)
     good &= (rows["yaw"] >= -18000) & (rows["yaw"] < 18000)
     for name in set(rows.dtype.names or ()) & {"velocity", "descriptor"}:
@@ -482,7 +484,7 @@ def merge_objects(parts: list[NDArray[Any]]) -> Boxes | None:
         center=torch.cat((torch.from_numpy(rows["xy"].astype(np.float32) / 100), height[:, None] / 2), -1),
         size=torch.cat((torch.from_numpy(rows["size"].astype(np.float32) / 10), height[:, None]), -1),
         yaw=torch.from_numpy(np.deg2rad(rows["yaw"] / 100).astype(np.float32)),
-        score=torch.from_numpy(rows["score"].astype(np.float32) / 255),
+        score=torch.from_numpy((rows["score"] / np.iinfo(rows["score"].dtype).max).astype(np.float32)),
         label=label,
         id=torch.from_numpy(np.where(ids == 255, -1, ids)),
         sigma_xy=torch.from_numpy(primitives.log_values(rows["sigma_xy"], *_SIGMA_XY)),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Wire format, versions 2 and 3: a message as packets that each decode alone, the most important first.
+"""Wire format, versions 2 to 4: a message as packets that each decode alone, the most important first.
 
 This text is the specification. All numbers are little-endian. A packet is a header, one body and a checksum:
 
@@ -7,7 +7,7 @@ This text is the specification. All numbers are little-endian. A packet is a hea
 offset bytes type     meaning
 ====== ===== ======== =====================================================================================
 0      2     bytes    ``ME``
-2      1     u8       version, 2 without the agent's body, 3 with it
+2      1     u8       version, 4; 3 and 2 are read too
 3      1     u8       flags: bits 0-2 kind of body (0 none, 1 tokens, 2 objects, 3 points, 4 request, 5 map
                       elements), bit 3 sender is infrastructure, bits 4-5 which part of the quaternion (w, x, y, z)
                       is left out, bit 6 the agent's body follows the header, bit 7 zero
@@ -23,13 +23,15 @@ offset bytes type     meaning
 53     3     3 x i8   lower factor L of their correlations (yx, wx wy), 1/127; the diagonal follows, since rows have
                       length 1 (a longer row is shortened): the covariance is never indefinite
 56     8     bytes    model fingerprint
-64     9              version 3, packet 0 only: the agent's body
+64     9              packet 0 only, where bit 6 is set: the agent's body
 ...    ...            body
 end-4  4     u32      CRC-32 (zlib) of everything before it
 ====== ===== ======== =====================================================================================
 
-The agent's body is the box of its vehicle in its own frame, which stands on the ground plane; without it, the body is unknown. A
-message of version 3 has it in its packet 0, and no packet of version 2 has it:
+Earlier versions differ in two points. Packet 0 of version 3 always has the agent's body, and version 2 never has it; both write the
+score of an object in one byte, 1/255, so that a row has 13 bytes.
+
+The agent's body is the box of its vehicle in its own frame, which stands on the ground plane; without it, the body is unknown:
 
 ====== ===== ======== =====================================================================================
 0      4     2 x i16  centre x, y, centimetres, within 20 m
@@ -53,19 +55,19 @@ Tokens (kind 1), some cells of one grid with their features:
 20     ...            layout 2, codes only: both, by ``entropy.pack_coded`` and the tables of the model's codebook
 ====== ===== ======== =====================================================================================
 
-Objects (kind 2): one byte of flags (bit 0 velocities, bit 1 descriptors, 2-7 zero, the same in all packets), then 13 bytes
+Objects (kind 2): one byte of flags (bit 0 velocities, bit 1 descriptors, 2-7 zero, the same in all packets), then 14 bytes
 each, in the sender's frame, highest score first:
 
 ====== ===== ======== =====================================================================================
 0      4     2 x i16  centre x, y, centimetres (to 327.67 m)
 4      2     i16      yaw, 0.01 degree, -18000 to 17999
 6      2     2 x u8   length, width, 0.1 m, 1 to 255; 255 means 25.5 m or more
-8      1     u8       score, 1/255
-9      1     u8       sigma_xy: 0 is 0; codes 1 to 255 are 0.01 to 20 m in equal ratios
-10     1     u8       sigma_yaw: 0 is 0; codes 1 to 255 are 0.001 to 3.2 rad in equal ratios
-11     1     u8       bits 0-2 label (index into LABELS), bits 3-7 probability that the heading is off by pi, 1/31
-12     1     u8       the sender's track id modulo 255; 255 is unknown
-13     2     2 x i8   with velocities: vx, vy over the ground, 0.25 m/s, -127 to 127; 127 means 31.75 m/s or more
+8      2     u16      score, 1/65535
+10     1     u8       sigma_xy: 0 is 0; codes 1 to 255 are 0.01 to 20 m in equal ratios
+11     1     u8       sigma_yaw: 0 is 0; codes 1 to 255 are 0.001 to 3.2 rad in equal ratios
+12     1     u8       bits 0-2 label (index into LABELS), bits 3-7 probability that the heading is off by pi, 1/31
+13     1     u8       the sender's track id modulo 255; 255 is unknown
+14     2     2 x i8   with velocities: vx, vy over the ground, 0.25 m/s, -127 to 127; 127 means 31.75 m/s or more
 ...    32    32 x i8  with descriptors: 1/127, -127 to 127
 ====== ===== ======== =====================================================================================
 
@@ -118,8 +120,9 @@ from manyeyes.comms.primitives import PacketError, log_codes, log_values
 from manyeyes.datatypes import AgentBody, BevGrid, ConfigError, Message, Transform, WireError
 from manyeyes.datatypes.message import RequestMap
 
-VERSION = 3
-VERSION_WITHOUT_BODY = 2
+VERSION = 4
+VERSION_COARSE_SCORES, VERSION_WITHOUT_BODY = 3, 2
+"""Earlier versions, which are read."""
 DEFAULT_MTU = 1398
 
 _MAGIC = b"ME"
@@ -249,12 +252,10 @@ def make_packets(message: Message, bodies: Sequence[EncodedBody]) -> list[bytes]
         )
     common = _common_fields(message)
     rest, count, packets = _COMMON.pack(*common.rest), len(bodies), []
-    version, agent_body = VERSION_WITHOUT_BODY, b""
-    if message.body is not None:
-        version, agent_body = VERSION, pack_agent_body(message.body)
+    agent_body = b"" if message.body is None else pack_agent_body(message.body)
     for number, (kind, content) in enumerate(bodies):
         flags, extension = (common.flags, b"") if number else (common.flags | bool(agent_body) * _HAS_BODY, agent_body)
-        start = _START.pack(_MAGIC, version, flags | kind, number, count)
+        start = _START.pack(_MAGIC, VERSION, flags | kind, number, count)
         packet = b"".join((start, rest, extension, content))
         packets.append(packet + _CRC.pack(zlib.crc32(packet)))
     return packets
@@ -385,10 +386,11 @@ def open_packet(packet: bytes) -> Envelope:
     packet = packet if type(packet) is bytes else bytes(memoryview(packet))
     if len(packet) < 3 or packet[:2] != _MAGIC:
         raise PacketError("garbage", f"Not a manyeyes packet: expected the bytes {_MAGIC!r}, got {packet[:2]!r}.")
-    if packet[2] not in (VERSION_WITHOUT_BODY, VERSION):
-        known = f"{VERSION_WITHOUT_BODY} or {VERSION}"
+    version = packet[2]
+    if not VERSION_WITHOUT_BODY <= version <= VERSION:
+        known = f"{VERSION_WITHOUT_BODY} to {VERSION}"
         raise PacketError(
-            "version", f"Wire version {packet[2]} is not known here; expected {known}: update the older side."
+            "version", f"Wire version {version} is not known here; expected {known}: update the older side."
         )
     if len(packet) < HEADER_BYTES:
         raise PacketError("garbage", f"Truncated packet: {len(packet)} bytes, a header alone has {HEADER_BYTES}.")
@@ -397,8 +399,12 @@ def open_packet(packet: bytes) -> Envelope:
     if _CRC.unpack_from(packet, len(packet) - _CRC.size)[0] != zlib.crc32(memoryview(packet)[: -_CRC.size]):
         agent_id = _COMMON.unpack(common)[0]
         raise PacketError("checksum", f"The checksum of a packet with agent id {agent_id} does not match its bytes.")
-    has_body = packet[2] == VERSION and number == 0
-    if flags >> 7 or number >= count or bool(flags & _HAS_BODY) != has_body:
+    has_body = bool(flags & _HAS_BODY)
+    may_have_body, must_have_body = (
+        number == 0 and version >= VERSION_COARSE_SCORES,
+        number == 0 and version == VERSION_COARSE_SCORES,
+    )
+    if flags >> 7 or number >= count or not must_have_body <= has_body <= may_have_body:
         raise PacketError("garbage", f"Contradictory header: flags {flags:#04x}, packet {number} of {count}.")
     header = _header(common, flags >> 3 & 7, count)
     if not has_body:
@@ -415,7 +421,8 @@ def read_fragment(envelope: Envelope, tables: CodeTables | None = None) -> Fragm
     tables: of the reader's weights, by which coded tokens are read.
     """
     header, packet = envelope.header, envelope.packet
-    body = payloads.read_body(envelope.kind, packet[envelope.body_at : -_CRC.size], header.fingerprint, tables)
+    content, has_fine_scores = packet[envelope.body_at : -_CRC.size], packet[2] > VERSION_COARSE_SCORES
+    body = payloads.read_body(envelope.kind, content, header.fingerprint, tables, has_fine_scores)
     return Fragment(header, envelope.number, body, packet, envelope.agent_body)
 
 
