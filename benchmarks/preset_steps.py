@@ -41,7 +41,7 @@ SPLITS = (
 )
 FRAMES = 5
 NETWORKS = ("preset", "small")
-METHODS = ("none", "intermediate")
+METHODS = ("no-fusion", "intermediate-temporal")
 LEARNING_RATE = 1e-3
 """Of both networks: the published 2e-4 moves little in 200 steps."""
 

@@ -43,7 +43,7 @@ from manyeyes.studies.provenance import write_json  # noqa: E402
 
 TENTH_NS = 100_000_000
 NUM_AGENTS = 4
-STRATEGIES = ("intermediate", "late")
+STRATEGIES = ("intermediate-temporal", "late")
 WARMUP = 3
 
 

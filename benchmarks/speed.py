@@ -38,7 +38,7 @@ from torch import Tensor
 from manyeyes.agents.agent import Agent
 from manyeyes.agents.own_detections import remove_own_body
 from manyeyes.agents.perception_cache import PerceptionCache, TokenOutput
-from manyeyes.agents.strategies.intermediate import gather_ego_tokens
+from manyeyes.agents.strategies.intermediate_temporal import gather_ego_tokens
 from manyeyes.agents.strategies.message_header import make_header
 from manyeyes.agents.strategies.redundancy import novelty_score
 from manyeyes.comms import wire

@@ -38,7 +38,7 @@ def frame_of(*points: tuple[float, float, float], body: AgentBody | None = REAR_
 
 
 @pytest.mark.parametrize("body, count", [(REAR_AXLE, 2), (None, 4)])
-@pytest.mark.parametrize("name", ["none", "late", "early"])
+@pytest.mark.parametrize("name", ["no-fusion", "late", "early"])
 def test_returns_from_the_own_vehicle_are_not_perceived(name: str, body: AgentBody | None, count: int) -> None:
     frame = frame_of((3.6, 0.5, 1.2), (0.0, 0.9, 0.9), (20.0, 1.0, 1.3), (-3.0, 0.0, 1.2), body=body)
     detector = Recorder()

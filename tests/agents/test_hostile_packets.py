@@ -106,8 +106,8 @@ def test_one_whole_packet_of_wrong_tokens_changes_nothing(drive, detector, what:
     """It raised in perceive, and again for as long as the history kept it."""
     honest = Agent(detector, token_encoding="float32").share(drive(2).frame(1, 2))[0]
     packet = forged(honest, 66, hostile_bodies(honest)[what], time_ns=2 * TENTH_NS)
-    clean = drive_through(detector, drive, "intermediate", [], own_inbox)
-    struck = drive_through(detector, drive, "intermediate", [(2, packet)], own_inbox)
+    clean = drive_through(detector, drive, "intermediate-temporal", [], own_inbox)
+    struck = drive_through(detector, drive, "intermediate-temporal", [(2, packet)], own_inbox)
     assert all(torch.equal(a.bev(), b.bev()) and torch.equal(a.score, b.score) for (a, _), (b, _) in zip(clean, struck))
     assert [names for _, names in clean] == [[]] * 14
     assert struck[2][1] == [(66, WRONG[what])]
@@ -115,7 +115,7 @@ def test_one_whole_packet_of_wrong_tokens_changes_nothing(drive, detector, what:
 
 def test_a_sender_with_invalid_content_is_rejected_and_the_others_are_fused(drive, detector) -> None:
     """A fusion of one's own that cannot bear something: the sender is named, the honest one still counts, no history is kept."""
-    intermediate = get_strategy("intermediate")
+    intermediate = get_strategy("intermediate-temporal")
 
     class Fragile(FusionStrategy):
         uses_history = True
@@ -169,7 +169,7 @@ def with_rows(detector, drive):
 def test_received_boxes_remove_no_own_detection(drive, detector, name: str, x_m: float) -> None:
     """Ten messages of 1,000 boxes at score 1 filled the suppression's list, and no own box was left."""
     frame, honest = with_rows(detector, drive)
-    alone = Agent(detector, get_strategy("none")).perceive(frame).boxes
+    alone = Agent(detector, get_strategy("no-fusion")).perceive(frame).boxes
     assert len(alone) > 5
     packets = [forged(honest, 70 + k, far_boxes(1000, x_m + k, 0.3 * k), kind=2) for k in range(10)]
     found = Agent(detector, get_strategy(name)).perceive(frame, packets).boxes
@@ -182,7 +182,7 @@ def test_received_boxes_remove_no_own_detection(drive, detector, name: str, x_m:
 def test_a_received_box_at_the_side_of_an_own_box_does_not_replace_it(drive, detector) -> None:
     """One box at score 1, 1.5 m beside each own one, suppressed them all."""
     frame, honest = with_rows(detector, drive)
-    alone = Agent(detector, get_strategy("none")).perceive(frame).boxes
+    alone = Agent(detector, get_strategy("no-fusion")).perceive(frame).boxes
     ego_from_sender = frame.world_from_agent.inverse() @ drive(2).frame(1, 2).world_from_agent
     beside = alone.transform(ego_from_sender.inverse())
     rows = b"".join(

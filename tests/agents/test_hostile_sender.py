@@ -93,7 +93,7 @@ def at_time(what: str) -> Callable[[Sequence[bytes], int], list[bytes]]:
 
 
 @pytest.mark.parametrize("what", TIMES)
-@pytest.mark.parametrize("name", ["late", "intermediate"])
+@pytest.mark.parametrize("name", ["late", "intermediate-temporal"])
 def test_messages_far_from_the_time_of_the_frame_change_nothing(
     drive, detector, scene_of, name: str, what: str
 ) -> None:
@@ -129,7 +129,7 @@ POSES: dict[str, Callable[[Transform], Transform]] = {
 
 
 @pytest.mark.parametrize("what", POSES)
-@pytest.mark.parametrize("name", ["late", "intermediate", "early"])
+@pytest.mark.parametrize("name", ["late", "intermediate-temporal", "early"])
 def test_a_sender_of_implausible_pose_changes_nothing_and_is_named(
     drive, detector, scene_of, name: str, what: str
 ) -> None:
@@ -149,7 +149,7 @@ ATTACKS_OF = {
         "boxes of full size at one place", "64 invented ids", "objects with descriptors at their extremes",
         "empty message 0.999 s later", "64 invented ids 0.999 s ahead", "5,000 empty packets",
     ),
-    "intermediate": (
+    "intermediate-temporal": (
         "features of 1e+20", "features of 3e+38", "float16 features of 60000", "one channel", "another grid",
         "another stride", "a channel too many", "largest covariance at 1e8 m", "stamps going back", "features of 32",
         "all cells by 8", "int8 features of the largest scale",
@@ -292,8 +292,8 @@ def test_a_failing_message_of_the_history_is_its_senders_rejection(drive, detect
 
 def test_the_number_of_fused_senders_and_tokens_is_bounded(drive, detector, scene_of) -> None:
     """32 senders that name every cell took a minute."""
-    scene = scene_of("intermediate", drive)
-    ego = Agent(detector, get_strategy("intermediate"))
+    scene = scene_of("intermediate-temporal", drive)
+    ego = Agent(detector, get_strategy("intermediate-temporal"))
     ego.limits = replace(ego.limits, max_fused_senders=5, max_fused_tokens=200)
     counts: list[list[int]] = []
     fuse = ego.strategy.fuse
@@ -312,7 +312,7 @@ def test_the_number_of_fused_senders_and_tokens_is_bounded(drive, detector, scen
     assert [r.reason for r in perception.rejected] == ["busy"] * 4
 
 
-@pytest.mark.parametrize("strategy", ["late", "intermediate"])
+@pytest.mark.parametrize("strategy", ["late", "intermediate-temporal"])
 def test_later_senders_displace_none_that_was_fused_before(drive, detector, scene_of, strategy) -> None:
     """Also after the later ones were fused in places that were free for an instant."""
     scene, ego = scene_of(strategy, drive), Agent(detector, get_strategy(strategy))
@@ -327,11 +327,11 @@ def test_later_senders_displace_none_that_was_fused_before(drive, detector, scen
 
 def test_tokens_of_a_message_with_too_many_are_excluded(drive, detector, scene_of) -> None:
     """The whole section: a message that names every cell left less than half of the honest boxes."""
-    scene = scene_of("intermediate", drive)
+    scene = scene_of("intermediate-temporal", drive)
     message = decoded(scene.packets[0][0])
     count = len(message.tokens.sites)
     for limit, rejected in ((count, []), (count - 1, [(1, "cells")])):
-        ego = Agent(detector, get_strategy("intermediate"))
+        ego = Agent(detector, get_strategy("intermediate-temporal"))
         ego.limits = replace(ego.limits, max_fused_message_tokens=limit)
         perception = ego.perceive(scene.frames[0], scene.packets[0][0])
         assert [(r.agent_id, r.reason) for r in perception.rejected] == rejected

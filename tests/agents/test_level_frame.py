@@ -103,7 +103,7 @@ def test_moving_a_frame_keeps_motion_by_odometry_and_pixels() -> None:
 
 
 @pytest.mark.parametrize("tilted", TILTS)
-@pytest.mark.parametrize("name", ["none", "late", "early"])
+@pytest.mark.parametrize("name", ["no-fusion", "late", "early"])
 def test_boxes_of_a_tilted_agent_come_back_in_its_own_frame(name: str, tilted: Transform) -> None:
     ego = Agent(Tall(), get_strategy(name))
     for index in range(2):
@@ -120,7 +120,7 @@ def test_without_levelling_the_road_of_a_tilted_sensor_is_an_object() -> None:
     frame = frame_of(0, POSES[0], TILTS[0])
     cache = PerceptionCache(Tall())
     cache.level = FrameLeveller(None)
-    boxes = Agent(Tall(), get_strategy("none"), perception_cache=cache).perceive(frame).boxes
+    boxes = Agent(Tall(), get_strategy("no-fusion"), perception_cache=cache).perceive(frame).boxes
     there = boxes.to(torch.float64).transform(frame.world_from_agent)
     assert math.dist(there.center[0, :2].tolist(), CAR) > 5.0
 

@@ -18,7 +18,7 @@ from manyeyes.models import pretrained
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.protocols import BoxDetector, has_tokens, require_tokens
 
-BOX_STRATEGIES = ("none", "late", "late-temporal", "early")
+BOX_STRATEGIES = ("no-fusion", "late", "late-temporal", "early")
 
 
 class BlobDetector(BoxDetector):
@@ -77,14 +77,14 @@ def test_strategies_of_boxes_and_points_fuse_an_own_detector(name: str) -> None:
 
 
 def test_an_own_detector_alone_sends_nothing() -> None:
-    agent = Agent(BlobDetector(), get_strategy("none"))
+    agent = Agent(BlobDetector(), get_strategy("no-fusion"))
     frame = frame_of(0, (20.0, 5.0))
     assert agent.share(frame) == [] and len(agent.perceive(frame).boxes) == 1
 
 
 def test_strategies_of_tokens_refuse_a_detector_of_boxes() -> None:
     needs_tokens = [name for name in list_strategies() if name.startswith("intermediate")]
-    assert len(needs_tokens) == 5
+    assert len(needs_tokens) == 10
     for name in needs_tokens:
         with pytest.raises(
             ConfigError, match="BlobDetector is a BoxDetector: it has no tokens, which intermediate fusion"
@@ -161,21 +161,28 @@ def test_the_default_fingerprint_names_class_and_version() -> None:
 def test_what_a_detector_lacks_is_named(change: dict[str, object], text: str) -> None:
     broken = type("Broken", (BlobDetector,), change)()
     with pytest.raises(ConfigError, match=text):
-        Agent(broken, get_strategy("none")).perceive(frame_of(0))
+        Agent(broken, get_strategy("no-fusion")).perceive(frame_of(0))
 
 
 def test_replay_takes_an_own_detector() -> None:
     steps = list(replay(Crossing(), "crossing", BlobDetector(), BOX_STRATEGIES, ReplayConfig()))
-    assert {step.method: len(step.boxes) for step in steps} == {"none": 0, "late": 1, "late-temporal": 1, "early": 1}
+    assert {step.method: len(step.boxes) for step in steps} == {
+        "no-fusion": 0,
+        "late": 1,
+        "late-temporal": 1,
+        "early": 1,
+    }
 
 
 def test_benchmark_takes_an_own_detector_and_returns_a_table() -> None:
     result = benchmark(Crossing(), BlobDetector(), BOX_STRATEGIES)
     assert [row.method for row in result.methods] == list(BOX_STRATEGIES)
-    assert result["none"].ap[0].ap == 0.0 and result["late"].ap[0].ap == 1.0
+    assert result["no-fusion"].ap[0].ap == 0.0 and result["late"].ap[0].ap == 1.0
     heading, *rows = str(result).splitlines()
     assert heading.split() == ["method", "AP@0.5", "AP@0.7", "bytes/message"]
-    assert [row.split()[:2] for row in rows][:2] == [["none", "0.000"], ["late", "1.000"]] and rows[0].endswith("-")
+    assert [row.split()[:2] for row in rows][:2] == [["no-fusion", "0.000"], ["late", "1.000"]] and rows[0].endswith(
+        "-"
+    )
     # Boxes beyond the range of the detector are not evaluated.
     assert result.protocol.gt_range == (-60.0, -60.0, -3.0, 60.0, 60.0, 3.0)
 

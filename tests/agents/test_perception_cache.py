@@ -130,14 +130,20 @@ def test_several_replays_of_one_recording_share_a_feature_cache(drive, detector:
     assert [part.tokens is first[0].shared_tokens.features for part in two.previous_tokens(copies[1])] == [True]
 
 
-def test_the_previous_merged_cloud_is_returned_in_the_new_frame(drive, detector: Detector) -> None:
+def test_merged_clouds_have_a_past_of_their_own_which_a_failed_perception_restores(drive, detector: Detector) -> None:
     cache, before, now = PerceptionCache(detector), drive().frame(0, 2), drive().frame(0, 3)
-    assert cache.previous_merged_cloud(before, before.points) is None
-    moved = cache.previous_merged_cloud(now, now.points)
-    assert moved is not None
-    assert torch.allclose(moved.xyz, before.points.xyz - torch.tensor([0.5, 0.0, 0.0]), atol=1e-4)
+    merged = [replace(f, points=PointCloud.cat([f.points, f.points])) for f in (before, now)]
+    cache.merged.process(merged[0])
+    kept = cache.history
+    first = cache.merged.process(merged[1])
+    assert [frame is merged[0] for frame, _ in cache.merged.previous_outputs(merged[1])] == [True]
+    assert cache.previous_outputs(before) == [], "the agent's own sweeps are apart"
+    cache.history = kept
+    again = cache.merged.process(replace(merged[1]))
+    assert torch.equal(again.boxes.center, first.boxes.center) and torch.equal(again.boxes.score, first.boxes.score)
     strange = discontinuous_frames(now)["a jump"]
-    assert cache.previous_merged_cloud(strange, strange.points) is None
+    cache.merged.process(strange)
+    assert cache.merged.previous_outputs(strange) == []
 
 
 def test_an_empty_sweep_is_a_past_with_nothing_in_it(drive, detector: Detector) -> None:
@@ -154,7 +160,7 @@ def test_multi_hop_messages_echo_the_receivers_own_tokens(drive, detector: Detec
     """CoSTr Eq. 1 to the letter: A receives its own car through B. B's own tokens contain none of A's."""
     first, then = drive(2).frames(2), drive(2).frames(3)
     blind = PointCloud.of(torch.zeros(0, 3))
-    for name, echoes in (("intermediate", False), ("intermediate-multihop", True)):
+    for name, echoes in (("intermediate-temporal", False), ("intermediate-multihop-temporal", True)):
         a, b = (Agent(detector, get_strategy(name), budget_bytes=None) for _ in range(2))
         b.perceive(replace(first[1], points=blind), a.share(first[0]))
         inbox = Inbox(detector.fingerprint)

@@ -164,7 +164,7 @@ def test_a_small_budget_covers_more_objects_than_confidence_selection(drive, det
                 found.append(place)
         return len(found)
 
-    assert objects("intermediate") > objects("intermediate-confidence")
+    assert objects("intermediate-temporal") > objects("intermediate-confidence-temporal")
 
 
 def test_no_tokens_give_no_scores(drive, detector: Detector):

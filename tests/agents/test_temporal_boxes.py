@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from manyeyes.agents.strategies.early import EarlyFusion
 from manyeyes.agents.strategies.late import LateFusion
 from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.agents.strategies.temporal_boxes import SCORE_DECAY_PER_100MS, decay_scores, merge_boxes_nms
@@ -113,18 +112,3 @@ def test_a_suppressed_own_box_is_restored_at_half_its_score_if_the_other_is_disp
     found = LateFusion().fuse(FixedCache(own), frame(9), [message_of(9, boxes(0.9, 21.5, score=0.9))])
     assert found.center[:, 0].tolist() == pytest.approx([0.9, 21.5, 20.0])
     assert found.score.tolist() == pytest.approx([0.9, 0.9, 0.15])
-
-
-def test_early_fusion_merges_received_clouds_and_keeps_no_history() -> None:
-    merged: list[PointCloud] = []
-
-    class CloudCache(FixedCache):
-        def previous_merged_cloud(self, frame: AgentFrame, cloud: PointCloud) -> None:
-            merged.append(cloud)
-
-        def run_detector(self, cloud: PointCloud, earlier: PointCloud | None) -> FixedOutput:
-            return FixedOutput(boxes())
-
-    cloud = PointCloud.of(torch.tensor([[6.0, 0.0, 1.0]]))
-    EarlyFusion().fuse(CloudCache(boxes()), frame(9), [replace(message_of(6, boxes()), points=cloud)])
-    assert merged[0].xyz.tolist() == [[6.0, 0.0, 1.0]] and not EarlyFusion().uses_history

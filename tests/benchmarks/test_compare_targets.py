@@ -60,12 +60,12 @@ def test_a_minimum_may_depend_on_the_baseline() -> None:
 def test_rows_of_evaluate_have_targets_of_their_own(tmp_path, monkeypatch, capsys) -> None:
     interval = {"value": 0.6, "low": 0.55, "high": 0.65, "confidence_level": 0.95, "num_scenarios": 9}
     rows = [
-        {"method": "none", "ap50": interval, "bytes_per_message": 0.0},
+        {"method": "no-fusion", "ap50": interval, "bytes_per_message": 0.0},
         {"method": "intermediate", "ap50": interval, "bytes_per_message": 200_000.0},
     ]
     path = tmp_path / "results.json"
     path.write_text(
-        json.dumps({"result": {"rows": rows, "differences": [comparison("intermediate - none", "AP@0.5", 0.2)]}})
+        json.dumps({"result": {"rows": rows, "differences": [comparison("intermediate - no-fusion", "AP@0.5", 0.2)]}})
     )
     monkeypatch.setattr(sys, "argv", ["compare_targets.py", str(path)])
     assert compare_targets.main() == 1, "the message is too large"

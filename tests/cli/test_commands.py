@@ -66,15 +66,15 @@ def run(*words: object) -> int:
 def test_run_writes_table_pictures_animation_report_and_json(data, weights, tmp_path, capsys) -> None:
     assert run("replay", data, "--split", "test", "--weights", weights, "--out", tmp_path, "--min-score", 0.9) == 0
     output = capsys.readouterr()
-    assert all(name in output.out for name in ("none", "late", "intermediate", "early", "report.html"))
+    assert all(name in output.out for name in ("no-fusion", "late", "intermediate", "early", "report.html"))
     made = {p.name for p in tmp_path.iterdir()}
-    pictures = {f"{name}.png" for name in ("none", "late", "intermediate", "early")}
+    pictures = {f"{name}.png" for name in ("no-fusion", "late", "intermediate", "early")}
     assert made == pictures | {"reliability.png", "drive.gif", "report.html", "results.json", "results.md"}
     held = json.loads((tmp_path / "results.json").read_text())
-    assert [n["method"] for n in held["result"]["stats"]] == ["none", "late", "intermediate", "early"]
+    assert [n["method"] for n in held["result"]["stats"]] == ["no-fusion", "late", "intermediate", "early"]
     assert held["provenance"]["config"]["detector"]["pillar_channels"] == COSTR_TINY.pillar_channels
     sent = {n["method"]: n["communication"]["bytes_per_message"] for n in held["result"]["stats"]}
-    assert sent["none"] is None and 0 < sent["late"] < sent["early"]
+    assert sent["no-fusion"] is None and 0 < sent["late"] < sent["early"]
     assert all(n["ap_summaries"][0]["n_gt"] == 2 for n in held["result"]["stats"])
     with Image.open(tmp_path / "drive.gif") as film:
         assert film.n_frames == 2
@@ -95,13 +95,13 @@ def test_two_runs_agree_except_for_times(data, weights, tmp_path) -> None:
 
 
 def test_evaluate_compares_methods_over_scenarios(data, weights, tmp_path, capsys) -> None:
-    words = ("--methods", "none", "intermediate", "--workers", 1, "--out", tmp_path)
+    words = ("--methods", "no-fusion", "intermediate", "--workers", 1, "--out", tmp_path)
     assert run("evaluate", "--data", data, "--split", "test", "--weights", weights, *words) == 0
-    assert "intermediate - none" in capsys.readouterr().out
+    assert "intermediate - no-fusion" in capsys.readouterr().out
     held = json.loads((tmp_path / "results.json").read_text())["result"]
     (half, seven) = held["differences"]
     assert (half["metric"], seven["metric"]) == ("AP@0.5", "AP@0.7")
-    assert half["description"] == "intermediate - none" and half["interval"]["num_scenarios"] == 2
+    assert half["description"] == "intermediate - no-fusion" and half["interval"]["num_scenarios"] == 2
     assert held["rows"][1]["perceive_ms"] > 0
 
 
@@ -258,7 +258,7 @@ def test_finetune_prints_the_holdout_before_and_after(data, weights, tmp_path, c
     assert "4 held out; 1 steps" in output and "after - before" in output and "minutes of CPU time" in output
     result = json.loads((tmp_path / "finetune.json").read_text())["result"]
     assert [(row["weights"], row["method"]) for row in result["rows"]] == [
-        (when, method) for when in ("before", "after") for method in ("none", "intermediate")
+        (when, method) for when in ("before", "after") for method in ("no-fusion", "intermediate-temporal")
     ]
     tuned = checkpoint.load(tmp_path / "weights.safetensors")
     assert tuned.codebook is not None and tuned.score_calibration is not None

@@ -18,12 +18,14 @@ import numpy as np
 REPOSITORY = Path(__file__).resolve().parents[2]
 PROBE = Path("tests") / "equivalence" / "probe.py"
 RENAMED = {
-    "alone": "none",
+    "alone": "no-fusion",
+    "none": "no-fusion",
+    "intermediate": "intermediate-temporal",
     "late-remembering": "late-temporal",
-    "learned": "intermediate-mi",
-    "confidence": "intermediate-confidence",
-    "random": "intermediate-random",
-    "fused": "intermediate-multihop",
+    "learned": "intermediate-mi-temporal",
+    "confidence": "intermediate-confidence-temporal",
+    "random": "intermediate-random-temporal",
+    "fused": "intermediate-multihop-temporal",
     "codes": "codebook",
     "vote": "voting",
     "given": "identity",

@@ -65,22 +65,22 @@ def test_ap_bytes_age_and_times_are_those_of_the_steps() -> None:
 
 
 def test_an_agent_that_sends_nothing_has_no_message_age_or_share_time() -> None:
-    result = accumulate("none", [1], sent_bytes=0)
+    result = accumulate("no-fusion", [1], sent_bytes=0)
     assert result.communication.num_messages == 0 and result.communication.num_ego_frames == 2
     assert math.isnan(result.age_ms) and math.isnan(result.share_ms) and result.perceive_ms == pytest.approx(50)
 
 
 def test_a_method_is_compared_with_every_other_at_both_thresholds() -> None:
     fused = [1, 1, 4, 1, 4]
-    results = [accumulate("none", [2] * 5), accumulate("intermediate", fused)]
+    results = [accumulate("no-fusion", [2] * 5), accumulate("intermediate", fused)]
     half, seven = compare_methods(results, PROTOCOL)
-    assert (half.description, half.metric, seven.metric) == ("intermediate - none", "AP@0.5", "AP@0.7")
+    assert (half.description, half.metric, seven.metric) == ("intermediate - no-fusion", "AP@0.5", "AP@0.7")
     assert half.interval.value == pytest.approx(sum(fused) / 20 - 0.5) and half.interval.num_scenarios == 5
     assert half.interval.low < half.interval.value < half.interval.high
 
 
 def test_without_the_method_there_is_nothing_to_compare() -> None:
-    assert compare_methods([accumulate("none", [1]), accumulate("late", [2])], PROTOCOL) == ()
+    assert compare_methods([accumulate("no-fusion", [1]), accumulate("late", [2])], PROTOCOL) == ()
     assert compare_methods([accumulate("intermediate", [1])], PROTOCOL) == ()
 
 

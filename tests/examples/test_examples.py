@@ -47,7 +47,7 @@ def test_01_two_agents() -> None:
 def test_02_evaluate_recording(tmp_path: Path) -> None:
     pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
     out = run("02_evaluate_recording.py", str(tmp_path / "drive"))
-    assert [line.split()[0] for line in out.strip().splitlines()] == ["none", "late", "intermediate", "early"]
+    assert [line.split()[0] for line in out.strip().splitlines()] == ["no-fusion", "late", "intermediate", "early"]
 
 
 @pytest.mark.slow
@@ -122,7 +122,7 @@ def test_the_code_of_a_guide_is_that_of_its_example_and_package(guide: str, exam
 def test_08_own_detector(tmp_path: Path) -> None:
     pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
     heading, *rows = run("08_own_detector.py", str(tmp_path / "drive")).strip().splitlines()[-4:]
-    assert heading.split()[0] == "method" and [row.split()[0] for row in rows] == ["none", "late", "early"]
+    assert heading.split()[0] == "method" and [row.split()[0] for row in rows] == ["no-fusion", "late", "early"]
     ap = [float(row.split()[1]) for row in rows]
     assert 0.1 < ap[0] < ap[1] < ap[2]
 
@@ -140,5 +140,5 @@ def test_10_own_data(tmp_path: Path) -> None:
     pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
     opened, heading, *rows = run("10_own_data.py", str(tmp_path / "drive")).strip().splitlines()[-5:]
     assert opened.split()[0] == "NpzRecording" and heading.split()[0] == "method"
-    assert [row.split()[0] for row in rows] == ["none", "late", "early"]
+    assert [row.split()[0] for row in rows] == ["no-fusion", "late", "early"]
     assert all(float(row.split()[1]) > 0.5 for row in rows)

@@ -14,10 +14,10 @@ def test_an_own_detector_is_evaluated_by_name(drive: Path, install, manyeyes, tm
     site = install("own_detector")
     words = ("evaluate", "--data", str(drive), "--split", "test", "--weights", "clusters")
     words = (*words, "--workers", "1", "--timing-frames", "0", "--frame-stride", "5", "--out", str(tmp_path / "out"))
-    done = manyeyes(site, *words, "--methods", "none", "late", "late-temporal", "early")
+    done = manyeyes(site, *words, "--methods", "no-fusion", "late", "late-temporal", "early")
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "out" / "results.json").read_text())["result"]["rows"]
-    assert [row["method"] for row in rows] == ["none", "late", "late-temporal", "early"]
+    assert [row["method"] for row in rows] == ["no-fusion", "late", "late-temporal", "early"]
     assert max(row["ap50"]["value"] for row in rows) > 0.02
 
     replay = (
@@ -28,7 +28,7 @@ def test_an_own_detector_is_evaluated_by_name(drive: Path, install, manyeyes, tm
         "--weights",
         "clusters",
         "--methods",
-        "none",
+        "no-fusion",
         "late",
         "--no-animate",
     )
@@ -38,7 +38,7 @@ def test_an_own_detector_is_evaluated_by_name(drive: Path, install, manyeyes, tm
     refused = manyeyes(site, *words, "--methods", "intermediate")
     assert refused.returncode == 1 and "ClusterDetector is a BoxDetector: it has no tokens" in refused.stderr
 
-    unknown = manyeyes(None, *words, "--methods", "none")
+    unknown = manyeyes(None, *words, "--methods", "no-fusion")
     assert (
         unknown.returncode == 1
         and "No weights are named 'clusters'; known are costr-sensors, costr-small" in unknown.stderr

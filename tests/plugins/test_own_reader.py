@@ -45,7 +45,7 @@ def test_view_replay_and_evaluate_open_its_recordings(clouds: Path, install, man
         torch.manual_seed(0)
         checkpoint.save(Detector(COSTR_TINY), tmp_path / "tiny.safetensors", {})
     site, out = install("own_reader"), str(tmp_path)
-    played = ("--split", "test", "--weights", f"{out}/tiny.safetensors", "--methods", "none", "early")
+    played = ("--split", "test", "--weights", f"{out}/tiny.safetensors", "--methods", "no-fusion", "early")
     viewed = manyeyes(site, "view", str(clouds), "--split", "test", "--out", f"{out}/frame.png")
     assert viewed.returncode == 0 and "crossing, frames 0 to 0" in viewed.stdout, viewed.stderr
     replayed = manyeyes(site, "replay", str(clouds), "--no-animate", "--out", f"{out}/replay", *played)

@@ -62,7 +62,7 @@ def prepare_runs(folder: Path) -> dict[str, Run]:
     simulate = ("simulate", "--preset", PRESET, "--workers", 1)
     train = ("train", "--data", data, "--split", "test", "--preset", PRESET)
     study = ("study", "num-agents", "--data", data, "--split", "test", "--workers", 1, "--weights", weights)
-    study = (*study, "--methods", "none", "late")
+    study = (*study, "--methods", "no-fusion", "late")
     runs = {
         "simulate": Run(simulate, data, check_recording, summarize_recording),
         "train": Run(train, folder / "train-0", check_training, summarize_training),

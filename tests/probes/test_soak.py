@@ -148,7 +148,7 @@ def soak(strategy: str, frames: int, every: int, pose_correction: PoseCorrection
 
 def corrections(strategy: str) -> PoseCorrection | None:
     """Pose correction, of the strategy that needs it most."""
-    return PoseCorrection() if strategy == "intermediate" else None
+    return PoseCorrection() if strategy == "intermediate-temporal" else None
 
 
 def fit_slope(samples: list[Sample], draws: int = 2000, block: int = 10) -> Slope:
@@ -176,14 +176,16 @@ def run_soak(strategy: str, frames: int, out: Path) -> list[Sample]:
 @pytest.mark.slow
 def test_a_receiver_holds_no_more_after_many_frames(tmp_path: Path) -> None:
     """Everything is as some periods before, but for ids and times: so are the tensors, and what the allocators have in use."""
-    first, *_, last = run_soak("intermediate", WARMUP + 6 * PERIOD, tmp_path / "soak.json")[WARMUP // EVERY - 1 :]
+    first, *_, last = run_soak("intermediate-temporal", WARMUP + 6 * PERIOD, tmp_path / "soak.json")[
+        WARMUP // EVERY - 1 :
+    ]
     assert last.tensors == first.tensors
     assert last.in_use_kb - first.in_use_kb < MAX_KB_PER_FRAME * (last.frame - first.frame)
     assert last.blocks - first.blocks < last.frame - first.frame
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("strategy", ["late-temporal", "intermediate"])
+@pytest.mark.parametrize("strategy", ["late-temporal", "intermediate-temporal"])
 def test_resident_memory_does_not_grow(strategy: str, tmp_path: Path) -> None:
     samples = run_soak(strategy, 10_000, tmp_path / "soak.json")
     slope = fit_slope(samples[len(samples) // 10 :])

@@ -105,7 +105,7 @@ def small_set(monkeypatch) -> tuple:
 @pytest.mark.slow
 def test_robustness_has_a_row_per_perturbation_and_method(data, weights, tmp_path, small_set, panels) -> None:
     held = evaluate(
-        data, weights, tmp_path, "robustness", "--methods", "none", "late", "intermediate", "--frame-stride", 2
+        data, weights, tmp_path, "robustness", "--methods", "no-fusion", "late", "intermediate", "--frame-stride", 2
     )
     rows, origin = held["result"]["rows"], held["provenance"]
     assert {"command", "seed", "versions", "git_commit", "config"} <= set(origin)
@@ -127,7 +127,7 @@ def test_robustness_has_a_row_per_perturbation_and_method(data, weights, tmp_pat
     assert all("margin" not in c and "verdict" not in c for c in comparisons), "targets are not the package's"
     assert [p.title for p in panels] == ["Delay", "Heading noise", "Position noise", "Packet loss", "Combined"]
     assert {c.label: c.x for c in panels[0].curves} == {
-        "none": (),
+        "no-fusion": (),
         "late": (0, 0.1, 0.4),
         "intermediate": (0, 0.1, 0.4),
     }
@@ -178,7 +178,7 @@ def test_an_interrupted_study_resumes_and_a_finished_one_replays_nothing(
     data, weights, tmp_path, monkeypatch, small_set, panels
 ) -> None:
     monkeypatch.setattr(robustness, "ALL_PERTURBATIONS", small_set[:4])
-    words = ("--methods", "none", "late", "--frame-stride", 2)
+    words = ("--methods", "no-fusion", "late", "--frame-stride", 2)
     first = evaluate(data, weights, tmp_path, "robustness", *words)["result"]
     cells = sorted((tmp_path / "cells").iterdir())
     assert len(cells) == 1 + 4
@@ -197,7 +197,16 @@ def test_an_interrupted_study_resumes_and_a_finished_one_replays_nothing(
 
 @pytest.mark.slow
 def test_budgets_are_respected_and_small_ones_send_less(data, weights, tmp_path) -> None:
-    words = ("--methods", "none", "late", "--token-selection", "intermediate", "--token-encodings", "float16", "int8")
+    words = (
+        "--methods",
+        "no-fusion",
+        "late",
+        "--token-selection",
+        "intermediate",
+        "--token-encodings",
+        "float16",
+        "int8",
+    )
     held = evaluate(data, weights, tmp_path, "bandwidth", *words, "--budgets", 1398, 4096, "--frame-stride", 2)[
         "result"
     ]
@@ -209,15 +218,15 @@ def test_budgets_are_respected_and_small_ones_send_less(data, weights, tmp_path)
         assert row["budget_bytes"] is None or 0 < row["max_message_bytes"] <= row["budget_bytes"]
         assert row["bytes_per_message"] <= row["max_message_bytes"] and row["compression_ratio"] > 1
     assert rows[0]["bytes_per_message"] <= rows[1]["bytes_per_message"] <= rows[2]["bytes_per_message"]
-    assert {r["method"] for r in held["reference_rows"]} == {"none", "late"}
+    assert {r["method"] for r in held["reference_rows"]} == {"no-fusion", "late"}
 
 
 @pytest.mark.slow
 def test_numbers_of_agents_are_evaluated_on_scenarios_that_have_them(data, weights, tmp_path, panels) -> None:
-    words = ("--methods", "none", "late", "--frame-stride", 2)
+    words = ("--methods", "no-fusion", "late", "--frame-stride", 2)
     rows = evaluate(data, weights, tmp_path, "num-agents", *words)["result"]["rows"]
     assert [(r["num_agents"], r["method"], r["num_scenarios"]) for r in rows] == [
-        (1, "none", 2), (1, "late", 2), (2, "late", 2), (3, "late", 1),
+        (1, "no-fusion", 2), (1, "late", 2), (2, "late", 2), (3, "late", 1),
     ]  # fmt: skip
     assert rows[1]["bytes_per_message"] == 0 < rows[2]["bytes_per_message"]
     assert rows[1]["gain_over_no_fusion"]["value"] == 0 and rows[2]["gain_over_one_fewer"]["num_scenarios"] == 2
@@ -250,20 +259,20 @@ def test_a_checkpoint_of_the_ablation_may_have_a_budget(data, weights, tmp_path,
 
 @pytest.mark.slow
 def test_with_shared_bandwidth_every_agent_is_ego_under_one_budget(data, weights, tmp_path, panels) -> None:
-    words = ("--methods", "none", "--token-selection", "intermediate", "--budgets", 6000, "--frame-stride", 2)
+    words = ("--methods", "no-fusion", "--token-selection", "intermediate", "--budgets", 6000, "--frame-stride", 2)
     rows = evaluate(data, weights, tmp_path, "shared-bandwidth", *words)["result"]["rows"]
     bound, alone = rows
-    assert (bound["budget_bytes"], alone["budget_bytes"], alone["method"]) == (6000, None, "none")
+    assert (bound["budget_bytes"], alone["budget_bytes"], alone["method"]) == (6000, None, "no-fusion")
     assert 0 < bound["mean_snapshot_bytes"] <= bound["max_snapshot_bytes"] <= 6000
     assert bound["num_ego_frames"] == alone["num_ego_frames"] == 2 + 3
-    assert {c.label: len(c.x) for c in panels[0].curves} == {"intermediate": 1, "none": 0}
+    assert {c.label: len(c.x) for c in panels[0].curves} == {"intermediate": 1, "no-fusion": 0}
 
 
 @pytest.mark.slow
 def test_the_qualitative_study_shows_the_frame_with_max_agents(data, weights, tmp_path) -> None:
     held = evaluate(data, weights, tmp_path, "qualitative")["result"]
     assert (held["scenario"], held["frame"]) == ("b", 5)
-    assert [r["method"] for r in held["rows"]] == ["none", "late", "intermediate", "early"]
+    assert [r["method"] for r in held["rows"]] == ["no-fusion", "late", "intermediate", "early"]
     assert all(r["num_true"] == 2 for r in held["rows"])
 
 
@@ -283,7 +292,7 @@ def test_conditions_side_by_side_are_as_each_by_itself(data, weights) -> None:
 
 
 def test_no_fusion_is_the_same_under_every_perturbation(data, weights) -> None:
-    base = BenchmarkConfig(str(weights), ("none",))
+    base = BenchmarkConfig(str(weights), ("no-fusion",))
     calm, rough = run_scenario(
         partial(Opv2vRecording, data, "test"), [CLEAN.apply_to(base), COMBINED_SEVERE.apply_to(base)], "b"
     )

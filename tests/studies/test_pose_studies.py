@@ -81,7 +81,7 @@ def evaluate(data, out, study, *words):
 
 @pytest.mark.slow
 def test_every_corrector_with_every_fusion_under_the_requested_levels(data, tmp_path) -> None:
-    words = ("--methods", "none", "intermediate", "--frame-stride", 2, "--perturbations", "2°, 2 m", "0.8 m")
+    words = ("--methods", "no-fusion", "intermediate", "--frame-stride", 2, "--perturbations", "2°, 2 m", "0.8 m")
     held = evaluate(data, tmp_path, "pose-noise-ap", *words)
     assert [(r["corrector"], r["method"]) for r in held["rows"][::3]] == [
         ("identity", "intermediate"),

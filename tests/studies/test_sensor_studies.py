@@ -45,7 +45,17 @@ def run(root: Path, weights: Path, out: Path, study: str, *words: object) -> int
 
 @pytest.mark.slow
 def test_sensors_has_a_row_for_each_recording_change_and_method(root, weights, tmp_path) -> None:
-    words = ("--split", "test", "--other-data", root / "beams-32", "--laws", "material", "zero", "--methods", "none")
+    words = (
+        "--split",
+        "test",
+        "--other-data",
+        root / "beams-32",
+        "--laws",
+        "material",
+        "zero",
+        "--methods",
+        "no-fusion",
+    )
     assert run(root, weights, tmp_path, "sensors", *words, "intermediate", "--tilts-deg", 0, 1.5) == 0
     result = json.loads((tmp_path / "sensors.json").read_text())["result"]
     rows = result["rows"]
@@ -55,7 +65,7 @@ def test_sensors_has_a_row_for_each_recording_change_and_method(root, weights, t
         for law in ("material", "zero")
         for sweeps in (1, 2)
         for tilt in (0.0, 1.5)
-        for method in ("none", "intermediate")
+        for method in ("no-fusion", "intermediate")
     }
     named = {(r["recording"], r["law"], r["sweeps"], r["tilt_deg"], r["method"]) for r in rows}
     assert named == expected and len(rows) == len(expected)
@@ -71,14 +81,14 @@ def test_sensors_has_a_row_for_each_recording_change_and_method(root, weights, t
 
 @pytest.mark.slow
 def test_strata_are_reported_apart(root, weights, tmp_path) -> None:
-    assert run(root, weights, tmp_path, "strata", "--methods", "none", "intermediate") == 0
+    assert run(root, weights, tmp_path, "strata", "--methods", "no-fusion", "intermediate") == 0
     result = json.loads((tmp_path / "strata.json").read_text())["result"]
     assert [(r["stratum"], r["method"]) for r in result["rows"]] == [
-        (stratum, method) for stratum in ("test", "town-2") for method in ("none", "intermediate")
+        (stratum, method) for stratum in ("test", "town-2") for method in ("no-fusion", "intermediate")
     ]
     assert [c["description"] for c in result["comparisons"]][::2] == [
-        "intermediate - none, test",
-        "intermediate - none, town-2",
+        "intermediate - no-fusion, test",
+        "intermediate - no-fusion, town-2",
     ]
 
 

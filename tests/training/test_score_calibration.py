@@ -85,7 +85,7 @@ def test_ap_is_unchanged_and_calibrated_weights_are_refused(toy):
         detector = Detector(replace(COSTR_TINY, prune_threshold=0.0)).eval().requires_grad_(False)
     detector.head.out.bias[0] = 1.0
     recording = toy(agents_n=2, points_per_car=20, ground_points=60)
-    methods = ("none", "late", "intermediate")
+    methods = ("no-fusion", "late", "intermediate")
     replay = ReplayConfig()
     before = benchmark(recording, detector, methods, replay=replay)
     calibration, boxes = calibrate_detector(lambda: recording, detector)

@@ -22,7 +22,7 @@ from manyeyes.agents.pose_plausibility import (
     find_pose_fault,
     with_unknown_pose,
 )
-from manyeyes.agents.strategies.intermediate import IntermediateFusion
+from manyeyes.agents.strategies.intermediate_temporal import TemporalIntermediateFusion
 from manyeyes.agents.strategies.message_header import make_header
 from manyeyes.agents.strategies.registry import FusionStrategy
 from manyeyes.agents.strategies.request_maps import make_request_map
@@ -112,7 +112,7 @@ class Agent:
         self._sender_states: Mapping[int, SenderState] = {}
         self._accepted_poses: AcceptedPoses = {}
         self._known_senders: KnownSenders = {}
-        self.strategy = strategy or IntermediateFusion()
+        self.strategy = strategy or TemporalIntermediateFusion()
         self._quarantine = Quarantine()
         self.limits = ReceiverLimits() if self.strategy.uses_points else ReceiverLimits(max_points=0)
         if self.strategy.needs_tokens:

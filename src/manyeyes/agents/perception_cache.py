@@ -77,8 +77,8 @@ class TokenOutput:
 
 AgentOutput = BoxOutput | TokenOutput
 """Output of any detector: it has ``boxes``."""
-History = tuple[tuple[AgentFrame, PointCloud] | None, tuple[AgentFrame, SparseBev] | None]
-"""The last merged cloud and the last fused tokens, each with its frame."""
+History = tuple[tuple[tuple[AgentFrame, AgentOutput], ...], tuple[AgentFrame, SparseBev] | None]
+"""The outputs on the last merged clouds, and the last fused tokens, each with its frame."""
 
 
 class PerceptionCache:
@@ -100,7 +100,7 @@ class PerceptionCache:
         self.detector = detector
         self._max_frames, self._feature_cache, self._velocity_config = max_frames, feature_cache, velocity_config
         self._outputs: list[tuple[AgentFrame, AgentOutput]] = []
-        self._merged: tuple[AgentFrame, PointCloud] | None = None
+        self._merged: PerceptionCache | None = None
         self._sent: list[tuple[AgentFrame, SparseBev]] = []
         self.level = FrameLeveller()
         self.last_fused: tuple[AgentFrame, SparseBev] | None = None
@@ -181,21 +181,23 @@ class PerceptionCache:
         earlier = [(then, tokens) for then, tokens in self._sent if then is not frame]
         return [(then, tokens) for then, tokens in earlier[-HISTORY_FRAMES:] if is_consecutive(frame, then)]
 
-    def previous_merged_cloud(self, frame: AgentFrame, merged: PointCloud) -> PointCloud | None:
-        """Return the merged cloud of the previous frame, in this frame; the current one is stored for the next frame."""
-        last, self._merged = self._merged, (frame, merged)
-        if last is None or not is_consecutive(frame, last[0]):
-            return None
-        return last[1].transform(frame.now_from_earlier(last[0]))
+    @property
+    def merged(self) -> PerceptionCache:
+        """The cache of merged clouds, for early fusion: frames of this agent with the points of all messages."""
+        if self._merged is None:
+            self._merged = PerceptionCache(self.detector, self._max_frames, velocity_config=self._velocity_config)
+        return self._merged
 
     @property
     def history(self) -> History:
         """State changed by perception; assign an earlier value to restore it."""
-        return self._merged, self.last_fused
+        return () if self._merged is None else tuple(self._merged._outputs), self.last_fused
 
     @history.setter
     def history(self, history: History) -> None:
-        self._merged, self.last_fused = history
+        merged, self.last_fused = history
+        if self._merged is not None:
+            self._merged._outputs = list(merged)
 
     def run_detector(self, cloud: PointCloud, earlier: PointCloud | None = None) -> AgentOutput:
         """Detector output on any cloud in an agent's frame and on the previous one in the same frame; not cached."""

@@ -142,7 +142,7 @@ def _evaluate(holdout: Recording, weights: tuple[str | Path, ...], max_frames: i
     stride = max(1, sum(1 for _ in iter_eval_frames(holdout)) // max_frames)
     evaluated = FrameStride(holdout, stride)
     has_several = any(len(holdout.agents(name)) > 1 for name in holdout.scenarios)
-    methods = ("none", "intermediate") if has_several else ("none",)
+    methods = ("no-fusion", "intermediate-temporal") if has_several else ("no-fusion",)
     return tuple(benchmark(evaluated, str(path), methods) for path in weights)
 
 

@@ -45,7 +45,7 @@ class Options:
     width: PixelCount = 1280
     """Of the picture, pixels."""
     detect: str | None = None
-    """Also draw what one method finds: none, late, intermediate or early."""
+    """Also draw what one method finds: no-fusion, late, intermediate, early, or NAME-temporal."""
     min_score: Fraction | None = None
     """Detections below this score are not drawn; by default that of the weights, 0.4 if they are uncalibrated."""
     replay_options: ReplayOptions = field(default_factory=ReplayOptions)

@@ -94,7 +94,8 @@ class SharedBandwidthOptions(EvaluationOptions):
     budgets: tuple[ByteCount, ...] = ()
     """Budgets in bytes, of one message (bandwidth) or of all messages of a snapshot (shared-bandwidth); by default the study's."""
     token_selection: tuple[str, ...] = ()
-    """Methods that select tokens; by default intermediate, intermediate-confidence, intermediate-random."""
+    """Methods that select tokens; by default intermediate-temporal, intermediate-confidence-temporal,
+    intermediate-random-temporal."""
 
 
 @dataclass(frozen=True, kw_only=True)

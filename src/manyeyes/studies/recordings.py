@@ -68,7 +68,7 @@ def print_notes(recording: RecordingReader, console: Console, scenarios: Collect
     lines = list(recording.missing_summary)
     played = [name for name in recording.scenarios if scenarios is None or name in scenarios]
     if all(len(recording.agents(name)) < 2 for name in played):
-        lines.append("no scenario has a second agent: nothing is shared, and all methods find what 'none' finds")
+        lines.append("no scenario has a second agent: nothing is shared, and all methods find what 'no-fusion' finds")
     for line in lines:
         console.print(f"note: {line}", highlight=False, markup=False, soft_wrap=True)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from manyeyes._bounds import ByteCount, DurationMs
+from manyeyes.agents.strategies.names import current_name
 from manyeyes.datatypes import ConfigError
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
     from manyeyes.datasets.base import Recording
     from manyeyes.datatypes import Snapshot
 
-ALL_METHODS = ("none", "late", "intermediate", "early")
+ALL_METHODS = ("no-fusion", "late", "intermediate", "early")
 FRAME_PERIOD_MS = 100.0
 IDEAL_LATENCY_BUDGET_MS = 0.0
 
@@ -27,7 +28,7 @@ class ReplayOptions:
     weights: str = "costr-small"
     """Shipped weights or a registered detector by name, or a .safetensors file of 'manyeyes train'."""
     methods: tuple[str, ...] = ALL_METHODS
-    """What is compared: strategies by name, those of your own too; an unknown name lists the known ones."""
+    """What is compared: strategies by name, NAME-temporal with memory, those of your own too; an unknown name lists them."""
     channel: str = "ideal"
     """The channel between agents: ideal, its-g5, its-g5-27mbps, lte-v2x, nr-sidelink, cellular."""
     latency_budget_ms: DurationMs | None = None
@@ -43,6 +44,9 @@ class ReplayOptions:
     """Correct the poses of senders before fusion, by objects that both agents detect; leave out messages without a usable pose.
     Corrector: voting, feakm, a .safetensors file of FeaKM, or a baseline: identity, coalign, fpv-rcnn, feaco, icp, vips,
     v2x-reg-odist, v2x-reg-oiou, mash."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "methods", tuple(map(current_name, self.methods)))
 
     def make_replay_config(self, seed: int, all_egos: bool = False) -> ReplayConfig:
         """The same as the player takes it; unknown names are refused here, before any work."""

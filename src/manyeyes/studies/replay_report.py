@@ -38,11 +38,15 @@ if TYPE_CHECKING:
 REPORT = "report.html"
 WIDTH, FILM_WIDTH, FILM_FRAME_MS = 1280, 800, 200
 TITLES = {
-    "none": "No fusion",
+    "no-fusion": "No fusion",
+    "no-fusion-temporal": "No fusion, with memory",
     "late": "Late fusion: boxes are shared",
     "late-temporal": "Late fusion: boxes are shared and remembered",
+    "late-weighted": "Late fusion: boxes are shared and averaged",
     "intermediate": "Intermediate fusion: tokens are shared",
+    "intermediate-temporal": "Intermediate fusion: tokens are shared and remembered",
     "early": "Early fusion: all points are shared",
+    "early-temporal": "Early fusion: all points are shared and remembered",
 }
 
 
@@ -168,7 +172,7 @@ def find_min_score(detector: BoxDetector, method: str, chosen: float | None = No
 
 def _select_animated(methods: Sequence[str]) -> tuple[str, ...]:
     """Return the two methods whose difference is the point, or as many of them as were run."""
-    preferred = tuple(name for name in ("none", "intermediate") if name in methods)
+    preferred = tuple(name for name in ("no-fusion", "intermediate") if name in methods)
     return preferred or tuple(methods[:1])
 
 

@@ -41,7 +41,7 @@ def test_a_result_file_is_named_by_all_that_its_numbers_depend_on(weights, tmp_p
     def path(config: BenchmarkConfig, method: str, recording_hash: str) -> Path:
         return CellStore(tmp_path).path(make_cell(config, method, recording_hash))
 
-    base = BenchmarkConfig(str(weights / "0.safetensors"), ("none", "late"))
+    base = BenchmarkConfig(str(weights / "0.safetensors"), ("no-fusion", "late"))
     late = replace(channel_preset("ideal"), base_latency_s=0.1)
     others = [
         replace(base, weights=str(weights / "1.safetensors")),
@@ -60,7 +60,7 @@ def test_a_result_file_is_named_by_all_that_its_numbers_depend_on(weights, tmp_p
         )),
     ]  # fmt: skip
     paths = [path(config, "late", "data") for config in (base, *others)]
-    paths += [path(base, "none", "data"), path(base, "late", "other data")]
+    paths += [path(base, "no-fusion", "data"), path(base, "late", "other data")]
     assert len(set(paths)) == len(paths) == 21
     # Neither the company of other methods nor where the same weights lie makes a difference.
     (tmp_path / "copy.safetensors").write_bytes((weights / "0.safetensors").read_bytes())

@@ -31,12 +31,14 @@ class EarlyFusion(FusionStrategy):
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
         """Return boxes of the merged cloud and of the one merged before it."""
-        limit = max(MIN_POINT_LIMIT, OWN_POINTS_FACTOR * len(frame.points))
-        received = [
-            _thin(m.points, limit).transform(ego_from_sender(frame, m)) for m in messages if m.points is not None
-        ]
-        merged = PointCloud.cat([frame.points, *received])
-        return cache.run_detector(merged, cache.previous_merged_cloud(frame, merged)).boxes
+        return cache.merged.process(merge_clouds(frame, messages)).boxes
+
+
+def merge_clouds(frame: AgentFrame, messages: Sequence[Message]) -> AgentFrame:
+    """Return the frame with the points of all messages, moved into it."""
+    limit = max(MIN_POINT_LIMIT, OWN_POINTS_FACTOR * len(frame.points))
+    received = [_thin(m.points, limit).transform(ego_from_sender(frame, m)) for m in messages if m.points is not None]
+    return replace(frame, points=PointCloud.cat([frame.points, *received]))
 
 
 def _thin(cloud: PointCloud, max_points: int) -> PointCloud:

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Intermediate fusion: every agent sends tokens; the ego moves them into its frame and fuses them (CoSTr Eq. 1)."""
+"""Intermediate fusion: every agent sends tokens; the ego moves them into its frame and fuses them (CoSTr Eq. 1).
+
+Without memory: the ego's tokens of the present sweep and the newest message of each sender. ``intermediate_temporal`` remembers.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +15,8 @@ from torch import Tensor
 
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.message_header import age_s, ego_from_sender, make_header
-from manyeyes.agents.strategies.redundancy import novelty_score
+from manyeyes.agents.strategies.redundancy import distinct_score
 from manyeyes.agents.strategies.registry import FusionStrategy, register_strategy
-from manyeyes.agents.token_codec import has_token_history
 from manyeyes.comms.request_map import compute_request_weights
 from manyeyes.datatypes import AgentFrame, Boxes, Message, SparseBev
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat
@@ -59,8 +61,7 @@ class IntermediateFusion(FusionStrategy):
     score: order in which a budget keeps tokens. weigh: how requests of receivers change it.
     """
 
-    score: Callable[[PerceptionCache, AgentFrame], Tensor] = novelty_score
-    uses_history: bool = True
+    score: Callable[[PerceptionCache, AgentFrame], Tensor] = distinct_score
     needs_tokens: bool = True
     uses_points = False
     score_form = "fused"
@@ -83,8 +84,14 @@ class IntermediateFusion(FusionStrategy):
             cache.record_sent(frame, message.tokens)
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """Return boxes of the fused tokens, with the agent's own tokens of the last two frames."""
-        return cache.decode(cache.fuse(*gather_ego_tokens(cache, frame, messages))[1])
+        """Return boxes of the fused tokens."""
+        return cache.decode(cache.fuse(*self.gather(cache, frame, messages))[1])
+
+    def gather(
+        self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]
+    ) -> tuple[Tokens, Tokens | None]:
+        """Return the tokens that are fused, and the ego's own past ones among them, if any."""
+        return gather_tokens(cache, frame, messages), None
 
 
 register_strategy("intermediate-mi")(partial(IntermediateFusion, mask_score))
@@ -92,20 +99,18 @@ register_strategy("intermediate-confidence")(partial(IntermediateFusion, confide
 register_strategy("intermediate-random")(partial(IntermediateFusion, random_score))
 
 
-def gather_ego_tokens(
-    cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]
-) -> tuple[Tokens, Tokens | None]:
-    """Return the ego's current and past tokens with those of every message on the same lattice; and its own past tokens alone.
+def gather_tokens(
+    cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message], past: Sequence[AgentTokens] = ()
+) -> Tokens:
+    """Return the ego's tokens of a frame, those of every message on the same lattice, and its own past ones, in the ego's frame.
 
     Older tokens are propagated by their proposed velocity, and weighted by their age (``models.fusion.token_merge``).
     """
     own = cache.process_tokens(frame).shared_tokens
-    past = cache.previous_tokens(frame) if has_token_history(cache.detector) else []
     on_grid = [(m, m.tokens) for m in messages if m.tokens is not None and m.tokens.grid == own.grid]
     received = [_to_agent_tokens(frame, message, tokens.features, tokens.sites.xy) for message, tokens in on_grid]
     current = AgentTokens(0, own.features, own.sites.xy, is_infrastructure=frame.is_infrastructure)
-    tokens = to_ego_frame([current, *received, *past], own.grid, 1)
-    return tokens, to_ego_frame(past, own.grid, 1) if past else None
+    return to_ego_frame([current, *received, *past], own.grid, 1)
 
 
 def _to_agent_tokens(frame: AgentFrame, message: Message, features: Tensor, xy: Tensor) -> AgentTokens:

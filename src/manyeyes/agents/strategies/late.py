@@ -43,20 +43,27 @@ class LateFusion(FusionStrategy):
         return replace(make_header(frame, cache.detector.fingerprint), objects=found[found.score > self.min_score])
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
-        """Return all boxes in the ego's frame, propagated by their velocity, after non-maximum suppression.
+        """Return all boxes in the ego's frame, propagated by their velocity, one for each object.
 
         Scores of older boxes decay (``temporal_boxes``).
         """
         own, others = cache.process(frame).boxes, list[Boxes]()
         for m, lag_s in zip(messages, lag_behind_newest_s(messages)):
             if m.objects is not None:
-                there = m.objects.after(age_s(frame, m)).transform(ego_from_sender(frame, m))
+                there = self.place(frame, m, m.objects)
                 near = there[cache.detector.grid.contains(there.center[:, :2])]
                 best = near[near.score.argsort(descending=True, stable=True)[: self.max_boxes]]
                 others.append(decay_scores(best.to(own.center.dtype), lag_s))
         earlier = propagate_boxes(frame, cache.previous_outputs(frame)) if self.uses_history else []
-        ranked = merge_boxes_nms([own, *earlier, *others], self.nms_iou)
-        return restore_own_boxes(ranked, own, min_score=0.0)
+        return restore_own_boxes(self.merge([own, *earlier, *others]), own, min_score=0.0)
+
+    def place(self, frame: AgentFrame, message: Message, boxes: Boxes) -> Boxes:
+        """Return boxes of a message in the ego's frame, propagated by their velocity."""
+        return boxes.after(age_s(frame, message)).transform(ego_from_sender(frame, message))
+
+    def merge(self, boxes: list[Boxes]) -> Boxes:
+        """Return one box for each object, by falling score: the best one, after non-maximum suppression."""
+        return merge_boxes_nms(boxes, self.nms_iou)
 
 
 register_strategy("late-temporal")(partial(LateFusion, uses_history=True))

@@ -6,16 +6,20 @@ Information of agent A returns to A through B, counted twice and two messages ol
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from manyeyes.agents.perception_cache import PerceptionCache, is_consecutive
-from manyeyes.agents.strategies.intermediate import IntermediateFusion, gather_ego_tokens
+from manyeyes.agents.strategies.intermediate import IntermediateFusion
+from manyeyes.agents.strategies.intermediate_temporal import gather_ego_tokens
 from manyeyes.agents.strategies.message_header import make_header
+from manyeyes.agents.strategies.redundancy import novelty_score
 from manyeyes.agents.strategies.registry import register_strategy
 from manyeyes.datatypes import AgentFrame, Boxes, Message
+from manyeyes.models.fusion.transform_tokens import Tokens
 
 
 @register_strategy("intermediate-multihop")
@@ -37,7 +41,22 @@ class MultiHopFusion(IntermediateFusion):
 
     def fuse(self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]) -> Boxes:
         """Return boxes of the fused tokens; the tokens are stored for the next message."""
-        fused, raw = cache.fuse(*gather_ego_tokens(cache, frame, messages))
+        fused, raw = cache.fuse(*self.gather(cache, frame, messages))
         with torch.inference_mode():
             cache.last_fused = frame, cache.token_detector.make_tokens(fused.bev, raw)
         return cache.decode(raw)
+
+
+@register_strategy("intermediate-multihop-temporal")
+@dataclass(frozen=True)
+class TemporalMultiHopFusion(MultiHopFusion):
+    """The same with the tokens of the last two frames, own and received ones."""
+
+    score: Callable[[PerceptionCache, AgentFrame], Tensor] = novelty_score
+    uses_history: bool = True
+
+    def gather(
+        self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]
+    ) -> tuple[Tokens, Tokens | None]:
+        """Return the tokens of messages and of the agent's last three frames; and its past ones alone."""
+        return gather_ego_tokens(cache, frame, messages)

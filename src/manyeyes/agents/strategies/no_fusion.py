@@ -10,11 +10,12 @@ from manyeyes.agents.strategies.registry import FusionStrategy, register_strateg
 from manyeyes.datatypes import AgentFrame, Boxes, Message
 
 
-@register_strategy("none")
+@register_strategy("no-fusion")
 class NoFusion(FusionStrategy):
     """Single-agent perception without messages."""
 
     uses_points = False
+    waits_for_messages = False
 
     def compose_message(
         self, cache: PerceptionCache, frame: AgentFrame, requests: Sequence[Message] = ()

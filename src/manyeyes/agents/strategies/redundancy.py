@@ -25,13 +25,22 @@ SAME_OBJECT_M = 2.0
 def novelty_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
     """Return (N,) in [0, 1], of the shared tokens of a frame: sigmoid(heat) * REDUNDANCY_DECAY^(earlier tokens of the object)."""
     tokens = cache.process_tokens(frame).shared_tokens
+    sent_centres = [_propagate_centres(frame, then, sent) for then, sent in cache.recently_sent(frame)]
+    return _decay_scores(tokens, torch.cat([tokens.features.new_empty(0, 2), *sent_centres]))
+
+
+def distinct_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
+    """Return ``novelty_score`` for receivers that remember no message: only tokens of the same message count as earlier."""
+    tokens = cache.process_tokens(frame).shared_tokens
+    return _decay_scores(tokens, tokens.features.new_empty(0, 2))
+
+
+def _decay_scores(tokens: SparseBev, sent_centres: Tensor) -> Tensor:
+    """Return scores (N,) of tokens, of which receivers have the objects around sent_centres (M, 2)."""
     place, heat = proposed_centres(tokens), proposed_heat(tokens.features[:, -PROPOSAL_DIM:])
     rank = heat.argsort(descending=True, stable=True).argsort()
     more_confident = rank[None, :] < rank[:, None]
     num_earlier = (more_confident & (torch.cdist(place, place) < SAME_OBJECT_M)).sum(1)
-    sent_centres = torch.cat(
-        [place.new_empty(0, 2), *(_propagate_centres(frame, then, sent) for then, sent in cache.recently_sent(frame))]
-    )
     num_earlier += (torch.cdist(place, sent_centres) < SAME_OBJECT_M).any(1)
     return torch.sigmoid(heat) * REDUNDANCY_DECAY**num_earlier
 

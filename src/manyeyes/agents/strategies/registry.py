@@ -1,5 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Strategies by name: ours, and those of third parties (entry points of the group manyeyes.strategy)."""
+"""Strategies by name: ours, and those of third parties (entry points of the group manyeyes.strategy).
+
+Every strategy has two forms. NAME fuses the present sweep and the newest message of each sender; NAME-temporal also what was seen
+and received in the last HISTORY_FRAMES frames. Tables compare methods of one form. Common to all: a detector reads two sweeps, and
+velocities are estimated over half a second (``agents.velocity``).
+"""
 
 from __future__ import annotations
 
@@ -7,6 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from manyeyes.agents.perception_cache import PerceptionCache
+from manyeyes.agents.strategies.names import current_name
 from manyeyes.datatypes import AgentFrame, Boxes, Message
 from manyeyes.datatypes.registry import Registry
 from manyeyes.models.score_calibration import ScoreForm
@@ -19,12 +25,14 @@ class FusionStrategy(Protocol):
         uses_history: older messages of each sender are fused too, also of senders without a current message.
         needs_tokens: it needs a TokenDetector.
         uses_points: it fuses the clouds of messages; packets of clouds are refused otherwise, since their decoding takes time.
+        waits_for_messages: the ego answers when its latency budget has passed; false: at once, since it fuses no messages.
         score_form: form of its boxes, by which their scores are calibrated (``models.score_calibration``).
     """
 
     uses_history: bool = False
     needs_tokens: bool = False
     uses_points: bool = True
+    waits_for_messages: bool = True
     score_form: ScoreForm = "own"
 
     def compose_message(
@@ -60,4 +68,4 @@ def get_strategy(name: str) -> FusionStrategy:
     Raises:
         ConfigError: no strategy has the name.
     """
-    return _STRATEGIES.get(name)()
+    return _STRATEGIES.get(current_name(name))()

@@ -16,6 +16,7 @@ from pathlib import Path
 import torch
 
 from manyeyes.agents.replay import WARMUP_FRAMES, CachedOutputs, ReplayConfig, ReplayStep, replay
+from manyeyes.agents.strategies.names import current_name
 from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.datasets.base import Recording
 from manyeyes.datasets.odometry_drift import DriftingOdometry, OdometryDrift
@@ -44,7 +45,7 @@ class BenchmarkConfig:
     """
 
     weights: str | BoxDetector = pretrained.DEFAULT_DETECTOR
-    methods: tuple[str, ...] = ("none", "late", "intermediate", "early")
+    methods: tuple[str, ...] = ("no-fusion", "late", "intermediate", "early")
     protocol: str = "global-sort"
     replay: ReplayConfig = field(default_factory=ReplayConfig)
     pose_noise: PoseNoise | None = None
@@ -281,7 +282,7 @@ def _format_bytes(result: MethodResult) -> str:
 def benchmark(
     recording: Recording,
     detector: str | Path | BoxDetector = pretrained.DEFAULT_DETECTOR,
-    methods: Sequence[str] = ("none", "late", "intermediate", "early"),
+    methods: Sequence[str] = ("no-fusion", "late", "intermediate", "early"),
     protocol: str = "global-sort",
     replay: ReplayConfig | None = None,
     workers: int = 1,
@@ -302,7 +303,7 @@ def benchmark(
     """
     weights = str(detector) if isinstance(detector, Path) else detector
     replay = replay or ReplayConfig(warmup_frames=WARMUP_FRAMES).adapt_to(recording)
-    config = BenchmarkConfig(weights, tuple(methods), protocol, replay)
+    config = BenchmarkConfig(weights, tuple(map(current_name, methods)), protocol, replay)
     return BenchmarkResult(resolve_protocol(config), run_benchmark(partial(_return, recording), config, workers))
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from manyeyes.agents.strategies.names import TEMPORAL, has_memory
 from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS, MethodResult
 from manyeyes.evaluation.detection.protocols import DetectionProtocol
 from manyeyes.evaluation.statistics.bootstrap import Interval
@@ -15,8 +16,8 @@ from manyeyes.evaluation.statistics.bootstrap import Interval
 class Comparison:
     """A measured quantity with its interval, mostly one result minus another, paired over the same resamples.
 
-    description: the two results, such as ``intermediate - none``. metric: what is measured, such as ``AP@0.5``. baseline_value:
-    the value of a baseline beside a quantity that is no difference.
+    description: the two results, such as ``intermediate - no-fusion``. metric: what is measured, such as ``AP@0.5``.
+    baseline_value: the value of a baseline beside a quantity that is no difference.
     """
 
     description: str
@@ -28,18 +29,23 @@ class Comparison:
 def compare_methods(
     results: Sequence[MethodResult], protocol: DetectionProtocol, method: str = "intermediate"
 ) -> tuple[Comparison, ...]:
-    """Compare one method with every other, at every IoU threshold and of every class; nothing where the method was not run."""
+    """Compare one method with every other of the same form, without or with memory, at every IoU threshold and of every class.
+
+    method: its name without memory; nothing where it was not run.
+    """
     classes = list(dict.fromkeys(result.class_name for result in results))
-    ours = {result.class_name: result for result in results if result.method == method}
+    by_name = {(result.method, result.class_name): result for result in results}
     return tuple(
         Comparison(
-            f"{method} - {baseline.method}{f', {name}' if len(classes) > 1 else ''}",
+            f"{ours} - {baseline.method}{f', {name}' if len(classes) > 1 else ''}",
             f"AP@{iou:g}",
-            ours[name].paired_difference(baseline, column, protocol),
+            by_name[ours, name].paired_difference(baseline, column, protocol),
         )
+        for ours in (method, method + TEMPORAL)
         for name in classes
-        if name in ours
+        if (ours, name) in by_name
         for baseline in results
-        if baseline.class_name == name and baseline.method != method
+        if baseline.class_name == name and baseline.method != ours
+        if has_memory(baseline.method) == has_memory(ours)
         for column, iou in enumerate(IOU_THRESHOLDS)
     )

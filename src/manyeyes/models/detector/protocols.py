@@ -106,7 +106,7 @@ def require_tokens(detector: BoxDetector) -> TokenDetector:
         return detector
     raise ConfigError(
         f"{type(detector).__name__} is a BoxDetector: it has no tokens, which intermediate fusion and FeaKM send; use the methods "
-        "none, late, late-temporal or early, or a detector with tokens."
+        "no-fusion, late or early, or a detector with tokens."
     )
 
 

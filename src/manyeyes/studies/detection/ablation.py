@@ -19,14 +19,20 @@ from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.models import checkpoint
 from manyeyes.studies.detection.perturbations import CLEAN, Perturbation
 from manyeyes.studies.engine.conditions import Condition, ResultGrid
-from manyeyes.studies.engine.replay_study import OURS, PAPER_NOTE, parse_checkpoints, prepare_study, with_replay
+from manyeyes.studies.engine.replay_study import (
+    OURS_TEMPORAL,
+    PAPER_NOTE,
+    parse_checkpoints,
+    prepare_study,
+    with_replay,
+)
 from manyeyes.studies.engine.report import StudyContext
 from manyeyes.studies.options import AblationOptions
 from manyeyes.viz.curves import Curve, CurvePanel
 from manyeyes.viz.study_table import StudyTable, format_difference, format_interval, format_log2, format_number
 from manyeyes.viz.table import LOG2_BYTES
 
-LEARNED_MASK = "intermediate-mi"
+LEARNED_MASK = "intermediate-mi-temporal"
 PERTURBATIONS = (CLEAN, Perturbation(delay_s=0.2), Perturbation(position_sigma_m=0.4))
 PAPER_ROWS = (
     ("none", 0.875, 0.831, 0.762, 16.43),
@@ -61,7 +67,7 @@ class _AblationVariant:
 
     @property
     def method(self) -> str:
-        return OURS if self.budget_bytes is None else LEARNED_MASK
+        return OURS_TEMPORAL if self.budget_bytes is None else LEARNED_MASK
 
     def apply_to(self, base: BenchmarkConfig) -> BenchmarkConfig:
         """Return the configuration of a benchmark of this branch."""

@@ -19,7 +19,7 @@ from manyeyes.evaluation.statistics.comparison import Comparison
 from manyeyes.studies.engine.conditions import Condition, ResultGrid, ResultKey
 from manyeyes.studies.engine.replay_study import (
     NO_FUSION,
-    OURS,
+    OURS_TEMPORAL,
     prepare_study,
     resolve_token_selection,
     with_replay,
@@ -133,13 +133,13 @@ def make_comparisons(
     methods: Sequence[str],
 ) -> tuple[Comparison, ...]:
     """Compare our token selection: with all tokens at float32, and with the baselines at equal budgets."""
-    if OURS not in methods:
+    if OURS_TEMPORAL not in methods:
         return ()
-    reference = (_condition_name(None, REFERENCE_ENCODING), OURS)
+    reference = (_condition_name(None, REFERENCE_ENCODING), OURS_TEMPORAL)
     compressed = [
         r
         for r in result_rows
-        if (r.method, r.token_encoding) == (OURS, REFERENCE_ENCODING)
+        if (r.method, r.token_encoding) == (OURS_TEMPORAL, REFERENCE_ENCODING)
         and (r.compression_ratio or 0.0) >= MIN_COMPRESSION_RATIO
     ]
     cases = []
@@ -150,12 +150,14 @@ def make_comparisons(
         compact = [p for p in encodings if p not in ("float32", "float16")]
         cases += [(THREE_PACKETS_BYTES, p, f"{THREE_PACKETS_BYTES} B as {p}") for p in compact]
     out = [
-        results.compare(f"{what} - all, {REFERENCE_ENCODING}", (_condition_name(b, p), OURS), reference)
+        results.compare(f"{what} - all, {REFERENCE_ENCODING}", (_condition_name(b, p), OURS_TEMPORAL), reference)
         for b, p, what in cases
     ]
     for name in (_condition_name(b, p) for p in encodings for b in budgets if b is not None):
-        for baseline in (m for m in methods if m != OURS):
-            out.append(results.compare(f"{OURS} - {baseline}, {name}", (name, OURS), (name, baseline)))
+        for baseline in (m for m in methods if m != OURS_TEMPORAL):
+            out.append(
+                results.compare(f"{OURS_TEMPORAL} - {baseline}, {name}", (name, OURS_TEMPORAL), (name, baseline))
+            )
     return tuple(out)
 
 

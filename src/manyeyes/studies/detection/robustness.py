@@ -3,16 +3,18 @@
 
 Oracle rows tell what is lost to geometry from what is lost to the model: of each joint disturbance, the row with true poses has
 its delay and loss alone, the row without delay its errors of pose alone. Early fusion is the bound. No fusion receives nothing,
-hence is the same under every perturbation: it is run once. --checkpoints name=weights.safetensors adds
-baselines, such as variants of the ablation; for a fair comparison --weights is then the variant of as many steps.
+hence is the same under every perturbation: it is run once. Methods are compared within a form, without or with memory.
+--checkpoints name=weights.safetensors adds baselines, such as variants of the ablation, in the forms in which intermediate fusion
+is run; for a fair comparison --weights is then the variant of as many steps.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
+from manyeyes.agents.strategies.names import TEMPORAL, form_of
 from manyeyes.agents.strategies.registry import list_strategies
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.statistics.bootstrap import Interval
@@ -30,6 +32,8 @@ from manyeyes.studies.detection.perturbations import (
 )
 from manyeyes.studies.engine.conditions import Condition, ResultGrid, ResultKey
 from manyeyes.studies.engine.replay_study import (
+    ALONE,
+    FORMS,
     NO_FUSION,
     OURS,
     PAPER_NOTE,
@@ -90,7 +94,7 @@ def run(options: RobustnessOptions, context: StudyContext) -> None:
     """Run the robustness study and write its report."""
     study = prepare_study(options, context)
     methods = study.base.methods
-    collaborative = tuple(m for m in methods if m != NO_FUSION)
+    collaborative = tuple(m for m in methods if m not in ALONE)
     selected = select_perturbations(options.perturbations, ALL_PERTURBATIONS)
     conditions = [
         Condition(
@@ -104,13 +108,15 @@ def run(options: RobustnessOptions, context: StudyContext) -> None:
         raise ConfigError(
             f"The study 'robustness' has methods of the names {', '.join(name_clashes)}; name these baselines otherwise."
         )
-    for baseline, weights in baselines.items():
-        base = replace(study.base, methods=(OURS,), weights=weights)
+    forms = tuple(form for form in FORMS if OURS + form in methods)
+    for baseline, weights in baselines.items() if forms else ():
+        base = replace(study.base, methods=tuple(OURS + form for form in forms), weights=weights)
         conditions += [
             Condition(_result_key(d, baseline, (baseline,))[0], d.apply_to(base, study.pose_noise)) for d in selected
         ]
     results = study.run(conditions)
-    result_rows, comparisons = make_rows(results, tuple(baselines)), make_comparisons(results, tuple(baselines))
+    rows_of_baselines = tuple(baseline + form for baseline in baselines for form in forms)
+    result_rows, comparisons = make_rows(results, rows_of_baselines), make_comparisons(results, rows_of_baselines)
     tables = [
         _make_results_table(title, result_rows, group)
         for title, group in (
@@ -128,8 +134,10 @@ def run(options: RobustnessOptions, context: StudyContext) -> None:
 
 
 def _result_key(perturbation: Perturbation, method: str, baselines: Sequence[str]) -> ResultKey:
-    """Return the result key of a method, or of a baseline's weights."""
-    return (f"{method}: {perturbation.name}", OURS) if method in baselines else (perturbation.name, method)
+    """Return the result key of a method, or of a baseline's weights, with memory if its name says so."""
+    if method not in baselines:
+        return perturbation.name, method
+    return f"{method.removesuffix(TEMPORAL)}: {perturbation.name}", OURS + form_of(method)
 
 
 def make_rows(results: ResultGrid, baselines: Sequence[str] = ()) -> tuple[RobustnessRow, ...]:
@@ -144,7 +152,7 @@ def make_rows(results: ResultGrid, baselines: Sequence[str] = ()) -> tuple[Robus
 
 def _make_row(results: ResultGrid, perturbation: Perturbation, method: str, baselines: Sequence[str]) -> RobustnessRow:
     key, clean_key = (_result_key(d, method, baselines) for d in (perturbation, CLEAN))
-    no_fusion_key = (CLEAN.name, NO_FUSION)
+    no_fusion_key = (CLEAN.name, NO_FUSION + form_of(method))
     result = results.results[key]
     has_delay = perturbation == CLEAN or perturbation.delay_s > 0
     return RobustnessRow(
@@ -153,35 +161,35 @@ def _make_row(results: ResultGrid, perturbation: Perturbation, method: str, base
         method,
         results.ap_pair(key),
         results.difference_pair(clean_key, key),
-        results.difference_pair(key, no_fusion_key) if method != NO_FUSION else None,
+        results.difference_pair(key, no_fusion_key) if method not in ALONE else None,
         result.bytes_per_message,
         result.age_ms,
         tuple(results.bootstrap_ap(key, 0, speed_range) for speed_range in SPEED_RANGES.values()) if has_delay else (),
-        PAPER_AP50.get(perturbation) if method == OURS else None,
+        PAPER_AP50.get(perturbation) if method == OURS + form_of(method) else None,
     )
 
 
 def make_comparisons(results: ResultGrid, checkpoints: Sequence[str] = ()) -> tuple[Comparison, ...]:
-    """Compare our method with every other but the upper bound at each level, and each single perturbation with none."""
-    if (CLEAN.name, OURS) not in results.results:
-        return ()
-    baselines = [method for name, method in results.results if name == CLEAN.name and method not in (OURS, UPPER_BOUND)]
-    baselines += checkpoints
-    out = []
-    evaluated = [d for d in ALL_PERTURBATIONS if (d.name, OURS) in results.results]
+    """Compare our method with every other of its form but the upper bound at each level, and each single perturbation with none."""
+    return tuple(c for form in FORMS for c in _compareform_of(results, checkpoints, form))
+
+
+def _compareform_of(results: ResultGrid, checkpoints: Sequence[str], form: str) -> Iterator[Comparison]:
+    ours = OURS + form
+    if (CLEAN.name, ours) not in results.results:
+        return
+    methods = [method for name, method in results.results if name == CLEAN.name]
+    baselines = [m for m in (*methods, *checkpoints) if form_of(m) == form and m not in (ours, UPPER_BOUND + form)]
+    evaluated = [d for d in ALL_PERTURBATIONS if (d.name, ours) in results.results]
     for perturbation in evaluated:
         for baseline in baselines:
-            other = _result_key(CLEAN if baseline == NO_FUSION else perturbation, baseline, checkpoints)
-            description = f"{OURS} - {baseline}, {perturbation.name}"
-            out += [results.compare(description, (perturbation.name, OURS), other, iou) for iou in (0, 1)]
-    return (
-        *out,
-        *(
-            results.compare(f"{OURS}, {d.name} - {CLEAN.name}", (d.name, OURS), (CLEAN.name, OURS))
-            for d in evaluated
-            if d in LARGEST_SINGLE
-        ),
-    )
+            other = _result_key(CLEAN if baseline in ALONE else perturbation, baseline, checkpoints)
+            description = f"{ours} - {baseline}, {perturbation.name}"
+            for iou in (0, 1):
+                yield results.compare(description, (perturbation.name, ours), other, iou)
+    for d in evaluated:
+        if d in LARGEST_SINGLE:
+            yield results.compare(f"{ours}, {d.name} - {CLEAN.name}", (d.name, ours), (CLEAN.name, ours))
 
 
 def _make_results_table(title: str, result_rows: Sequence[RobustnessRow], group: Sequence[Perturbation]) -> StudyTable:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+from manyeyes.agents.strategies.names import TEMPORAL
 from manyeyes.agents.strategies.registry import get_strategy, list_strategies
 from manyeyes.datasets.base import RecordingReader
 from manyeyes.datasets.perturbation import PoseNoise
@@ -22,8 +23,13 @@ from manyeyes.viz.curves import CurvePanel, save_curves
 from manyeyes.viz.progress import track
 from manyeyes.viz.study_table import StudyTable
 
-NO_FUSION, OURS, UPPER_BOUND = "none", "intermediate", "early"
-TOKEN_SELECTION_METHODS = ("intermediate", "intermediate-confidence", "intermediate-random")
+NO_FUSION, OURS, UPPER_BOUND = "no-fusion", "intermediate", "early"
+OURS_TEMPORAL = OURS + TEMPORAL
+FORMS = ("", TEMPORAL)
+"""Ends of names of methods without and with memory; differences are of one form."""
+ALONE = tuple(NO_FUSION + form for form in FORMS)
+"""What receives nothing, and hence is the same under every perturbation."""
+TOKEN_SELECTION_METHODS = (OURS_TEMPORAL, "intermediate-confidence-temporal", "intermediate-random-temporal")
 PAPER_NOTE = (
     'The column "paper" holds CoSTr\'s own figures: another data set (OPV2V), unknown protocol; they are '
     "for reference only."

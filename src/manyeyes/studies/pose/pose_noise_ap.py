@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from manyeyes.agents.pose_correction import PoseCorrection
+from manyeyes.agents.strategies.names import form_of
 from manyeyes.datasets.base import Recording
 from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS
@@ -24,7 +25,15 @@ from manyeyes.evaluation.statistics.comparison import Comparison
 from manyeyes.pose.registry import load_corrector
 from manyeyes.studies.detection.perturbations import Perturbation, select_perturbations
 from manyeyes.studies.engine.conditions import Condition, ResultGrid, ResultKey
-from manyeyes.studies.engine.replay_study import NO_FUSION, OURS, parse_checkpoints, prepare_study, with_replay
+from manyeyes.studies.engine.replay_study import (
+    ALONE,
+    FORMS,
+    NO_FUSION,
+    OURS,
+    parse_checkpoints,
+    prepare_study,
+    with_replay,
+)
 from manyeyes.studies.engine.report import StudyContext
 from manyeyes.studies.options import PoseNoiseApOptions
 from manyeyes.viz.curves import Curve, CurvePanel
@@ -85,7 +94,7 @@ def run(options: PoseNoiseApOptions, context: StudyContext) -> None:
     levels = select_perturbations(options.perturbations, ALL_LEVELS)
     for name in names:
         load_corrector(name)
-    collaborative = tuple(m for m in study.base.methods if m != NO_FUSION)
+    collaborative = tuple(m for m in study.base.methods if m not in ALONE)
     base = replace(study.base, methods=collaborative)
     conditions = [
         Condition(condition_name(name, level), apply_level(base, level, name, study.pose_noise))
@@ -99,8 +108,8 @@ def run(options: PoseNoiseApOptions, context: StudyContext) -> None:
         conditions += [
             Condition(condition_name(baseline, level), level.apply_to(base, study.pose_noise)) for level in levels
         ]
-    if NO_FUSION in study.base.methods:
-        conditions.append(Condition(NO_FUSION, CLEAN.apply_to(replace(study.base, methods=(NO_FUSION,)))))
+    if alone := tuple(m for m in study.base.methods if m in ALONE):
+        conditions.append(Condition(NO_FUSION, CLEAN.apply_to(replace(study.base, methods=alone))))
     results = study.run(conditions)
     recording = study.base.filter_recording(study.opener())
     common = count_common_objects_by_frame(recording, study.base.replay.comm_range_m)
@@ -175,7 +184,7 @@ def _make_row(
     clean_key: ResultKey,
     common: CommonObjects,
 ) -> PoseNoiseRow:
-    no_fusion_key = (NO_FUSION, NO_FUSION)
+    no_fusion_key = (NO_FUSION, NO_FUSION + form_of(key[1]))
     return PoseNoiseRow(
         name,
         key[1],
@@ -196,18 +205,24 @@ def _bootstrap(results: ResultGrid, key: ResultKey, bucket: tuple[int, int], com
 
 
 def make_comparisons(results: ResultGrid, names: Sequence[str], common: CommonObjects) -> tuple[Comparison, ...]:
-    """Compare each corrector before the project's own fusion with true poses and with no fusion."""
-    if (condition_name(IDENTITY, CLEAN), OURS) not in results.results:
-        return ()
-    return tuple(c for name in names if name != IDENTITY for c in _compare_corrector(results, name, common))
+    """Compare each corrector before the project's own fusion with true poses and with no fusion of the same form."""
+    evaluated = [OURS + form for form in FORMS if (condition_name(IDENTITY, CLEAN), OURS + form) in results.results]
+    return tuple(
+        c
+        for ours in evaluated
+        for name in names
+        if name != IDENTITY
+        for c in _compare_corrector(results, name, ours, common)
+    )
 
 
-def _compare_corrector(results: ResultGrid, name: str, common: CommonObjects) -> Iterator[Comparison]:
+def _compare_corrector(results: ResultGrid, name: str, ours: str, common: CommonObjects) -> Iterator[Comparison]:
     """Compare with true poses: without noise, under a single noise, and under the largest by common objects; and the worst level
     with no fusion.
     """
-    clean_key, no_fusion_key, stem = (condition_name(IDENTITY, CLEAN), OURS), (NO_FUSION, NO_FUSION), Path(name).stem
-    keys = {level: (condition_name(name, level), OURS) for level in _select_evaluated(results, name, OURS)}
+    clean_key, no_fusion_key = (condition_name(IDENTITY, CLEAN), ours), (NO_FUSION, NO_FUSION + form_of(ours))
+    stem = Path(name).stem + form_of(ours)
+    keys = {level: (condition_name(name, level), ours) for level in _select_evaluated(results, name, ours)}
     for level, key in keys.items():
         if level in (CLEAN, *SINGLE_ERROR_LEVELS):
             yield results.compare(f"{stem}, {level.name}: corrected - true poses", key, clean_key)

@@ -25,7 +25,7 @@ from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, run_benchma
 from manyeyes.models.detector.protocols import BoxDetector
 from manyeyes.models.score_calibration import MIN_CALIBRATED_SCORE, ScoreCalibration, ScoreForm, ScoreMap
 
-METHODS = ("none", "late", "intermediate", "early")
+METHODS = ("no-fusion", "late", "intermediate-temporal", "early")
 """One strategy of each form."""
 MATCH_IOU = 0.5
 """A box is correct where it matches a vehicle at this IoU."""

@@ -49,20 +49,23 @@ def _end(indices: range, count: int) -> int:
 
 
 def measure_ap(weights: Path, recording: Recording) -> dict[str, float]:
-    """Return AP@0.5 of a file of weights on the CPU: intermediate fusion where there are several agents, then no fusion."""
+    """Return AP@0.5 of a file of weights on the CPU: intermediate fusion with memory where there are several agents, then no
+    fusion.
+    """
     methods = _select_methods(recording)
     threads = torch.get_num_threads()
     try:
         replay = ReplayConfig(warmup_frames=WARMUP_FRAMES).adapt_to(recording)
-        result = benchmark(recording, str(weights), methods, replay=replay)
+        result = benchmark(recording, str(weights), tuple(methods.values()), replay=replay)
     finally:
         torch.set_num_threads(threads)  # evaluation sets its own
-    return {f"ap50_{name}": float(result[name].intervals[0].value) for name in methods}
+    return {f"ap50_{key}": float(result[name].intervals[0].value) for key, name in methods.items()}
 
 
-def _select_methods(recording: Recording) -> tuple[str, ...]:
+def _select_methods(recording: Recording) -> dict[str, str]:
+    """Return the evaluated methods by their names in logs and cards, which stored runs have."""
     has_several = any(len(recording.agents(name)) > 1 for name in recording.scenarios)
-    return ("intermediate", "none") if has_several else ("none",)
+    return {**({"intermediate": "intermediate-temporal"} if has_several else {}), "none": "no-fusion"}
 
 
 def draw_frame(weights: Path, recording: Recording) -> dict[str, Image]:
@@ -76,9 +79,9 @@ def draw_frame(weights: Path, recording: Recording) -> dict[str, Image]:
     snapshots = [recording.snapshot(name, index) for index in range(max(0, last - WARMUP_FRAMES), last + 1)]
     detector, replay = pretrained.load(str(weights)), ReplayConfig().adapt_to(recording)
     pictures = {}
-    for method in _select_methods(recording):
+    for key, method in _select_methods(recording).items():
         player = DetectionReplay(method, detector, replay)
         boxes = [step.boxes for snapshot in snapshots for step in player.step(snapshot)][-1]
         scene, caption = make_scene(snapshots[-1], boxes), f"frame {last} · {method}"
-        pictures[method] = draw_scene(scene, detector.detection_range, name, caption, PICTURE_WIDTH, MIN_DRAWN_SCORE)
+        pictures[key] = draw_scene(scene, detector.detection_range, name, caption, PICTURE_WIDTH, MIN_DRAWN_SCORE)
     return pictures
