@@ -182,7 +182,7 @@ class FixedMatches:
 
 
 def test_a_pose_is_found_from_decoded_bytes():
-    """25 objects with a descriptor each: 45 bytes an object and one header; places come back to a centimetre."""
+    """25 objects with a descriptor each: 46 bytes an object and one header; places come back to a centimetre."""
     n, rng = 25, torch.Generator().manual_seed(2)
     seen = make_landmarks(n)
     boxes = Boxes.of(
@@ -196,7 +196,7 @@ def test_a_pose_is_found_from_decoded_bytes():
     ego = Keypoints(boxes.transform(move), descriptor)
     message = Message(3, 0, Transform.identity(), torch.zeros(3, 3), objects=boxes, descriptors=descriptor)
     packets = wire.encode(message)
-    assert len(packets) == 1 and 45 * n < len(packets[0]) <= 45 * n + 80
+    assert len(packets) == 1 and 46 * n < len(packets[0]) <= 46 * n + 80
     inbox = Inbox(bytes(8))
     inbox.push(packets[0])
     (received,) = inbox.received_messages()
