@@ -4,6 +4,7 @@
 import torch
 from tests.models.fusion_cases import CHANNELS, GRID, agent, at, draw_agent, rows_of, tokens_of
 
+from manyeyes.datatypes import SparseBev
 from manyeyes.models.fusion.by_cell import gather_by_cell, standing_cells
 
 
@@ -51,11 +52,13 @@ def test_the_softmax_over_senders_is_that_of_a_dense_stack() -> None:
         assert torch.allclose(zero[mates], full.softmax(0)[: len(mates)], atol=1e-6)
 
 
-def test_maps_of_senders_and_back() -> None:
+def test_maps_of_senders() -> None:
     rows = rows_of(draw_agent(0, False), draw_agent(1, True), draw_agent(2, True))
-    maps = rows.maps()
-    assert maps.sites.batch_size == 3 and torch.equal(rows.from_maps(maps.features), rows.features)
-    second = maps.dense()[1]
+    maps = rows.to_maps()
+    assert maps.sites.batch_size == 3 and maps.is_own.tolist() == (maps.sites.batch == 0).tolist()
+    assert torch.equal(maps.features[maps.is_own], rows.features[rows.is_own])
+    assert torch.equal(rows.sites.yx[maps.cell], maps.sites.yx)
+    second = SparseBev(maps.features, maps.sites).dense()[1]
     mine = (rows.agent == 1).nonzero()[:, 0]
     y, x = rows.sites.yx[rows.cell[mine]].unbind(1)
     assert torch.equal(second[:, y, x].T, rows.features[mine]) and int((second != 0).any(0).sum()) == len(mine)

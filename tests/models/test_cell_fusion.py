@@ -19,7 +19,7 @@ from manyeyes.models.fusion.transform_tokens import AgentTokens, to_ego_frame
 BARE = tuple(name for name in list_fusion_modules() if name.endswith("/bare"))
 RULES = tuple(name for bare in BARE if (name := bare.removesuffix("/bare")) in list_fusion_modules())
 ALL = (*RULES, *BARE)
-IDENTITY_ALONE = ("max/bare", "attfuse", "attfuse/bare")
+IDENTITY_ALONE = ("max/bare", "attfuse", "attfuse/bare", "disconet", "disconet/bare")
 """Fusions that return the features of one agent as they are."""
 
 
@@ -91,14 +91,18 @@ def test_messages_change_the_features_and_egos_of_a_batch_do_not(name: str) -> N
 
 @pytest.mark.parametrize("name", ALL)
 def test_gradients_reach_every_parameter_and_every_feature(name: str) -> None:
-    torch.manual_seed(0)
     model = fusion(name).train().requires_grad_(True)
+    if name.startswith("disconet"):
+        # Logits of either sign: a bias of all of them together does not change a softmax.
+        model.rule.weigh[-2].bias.data.fill_(-0.1)
     parts = agents()
     parts[1] = dataclasses.replace(parts[1], age_s=0.1)
+    # Another ego is a roadside unit.
+    parts += [dataclasses.replace(draw_agent(4 + k, k > 0, roadside=k == 0), ego=1) for k in range(2)]
     for part in parts:
         part.tokens[:, :CHANNELS] *= 2
         part.tokens.requires_grad_(True)
-    fused = model(tokens_of(*parts))
+    fused = model(tokens_of(*parts, batch_size=2))
     weight = torch.randn(fused.bev.features.shape, generator=torch.Generator().manual_seed(1))
     ((fused.bev.features * weight).sum() + fused.merged_proposals.square().sum()).backward()
     missing = [name for name, p in model.named_parameters() if p.grad is None or not bool(p.grad.abs().sum() > 0)]

@@ -13,13 +13,30 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from manyeyes.datatypes import Sites, SparseBev
+from manyeyes.datatypes import Sites
 from manyeyes.models.detector.proposal import proposed_heat
 from manyeyes.models.fusion.transform_tokens import Tokens
 from manyeyes.ops.sparse_index import distinct
 from manyeyes.ops.voxelize import segment_max, segment_sum
 
 AbsentSenders = Literal["zero", "masked"]
+
+
+@dataclass(frozen=True, eq=False)
+class SenderMaps:
+    """The rows of CellRows in the order of maps of their senders, which convolutions take.
+
+    Attributes:
+        features: (M, C).
+        sites: of the maps of all senders of all egos, a batch of grids.
+        cell: (M,) int64, as in CellRows.
+        is_own: (M,) bool, whether the map is that of the ego; its rows are in the order of the cells.
+    """
+
+    features: Tensor
+    sites: Sites
+    cell: Tensor
+    is_own: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +51,7 @@ class CellRows:
         infrastructure: (M,) bool, whether the sender is a roadside unit.
         sender_xy: (M, 2) mean position in the sender's own frame, metres.
         xy: (M, 2) mean position in the ego's frame, metres.
+        age: (M,) of the oldest token, in units of 100 ms.
         sites: the cells that any sender occupies.
         num_senders: of the ego that has most, itself included.
         count: (batch,) number of senders of each ego with at least one token, itself included.
@@ -46,6 +64,7 @@ class CellRows:
     infrastructure: Tensor
     sender_xy: Tensor
     xy: Tensor
+    age: Tensor
     sites: Sites
     num_senders: int
     count: Tensor
@@ -98,19 +117,13 @@ class CellRows:
         total = self.sum(weight) + self.num_absent[:, None] * (absent_logit - peak).exp()
         return weight / total[self.cell]
 
-    def maps(self) -> SparseBev:
-        """Return the rows as one sparse map a sender, a batch of grids in the order of ``map_order``."""
-        rows, columns = self.sites.grid.shape
-        within = self.sites.key.remainder(rows * columns)[self.cell]
-        key, order = (self.agent * (rows * columns) + within).sort()
-        batch = self.sites.batch_size * self.num_senders
-        return SparseBev(self.features.index_select(0, order), Sites(key, self.sites.grid, batch))
-
-    def from_maps(self, features: Tensor) -> Tensor:
-        """Return features (M, D) of the sites of ``maps`` in the order of the rows."""
+    def to_maps(self) -> SenderMaps:
+        """Return the rows as one sparse map a sender."""
         rows, columns = self.sites.grid.shape
         key = self.agent * (rows * columns) + self.sites.key.remainder(rows * columns)[self.cell]
-        return features.index_select(0, key.argsort().argsort())
+        key, order = key.sort()
+        sites = Sites(key, self.sites.grid, self.sites.batch_size * self.num_senders)
+        return SenderMaps(self.features.index_select(0, order), sites, self.cell[order], self.is_own[order])
 
     def with_own_everywhere(self) -> CellRows:
         """Return the rows and, on cells where the ego has none, a row of zeros of the ego: its dense map."""
@@ -138,6 +151,7 @@ class CellRows:
             infrastructure=join(self.infrastructure, roadside[batch]),
             sender_xy=join(self.sender_xy, xy),
             xy=join(self.xy, xy),
+            age=join(self.age, zeros[:, 0]),
         )
 
 
@@ -165,7 +179,8 @@ def gather_by_cell(features: Tensor, tokens: Tokens, key: Tensor) -> tuple[CellR
     of_tokens = torch.cat((tokens.sender_xy, tokens.xy, torch.ones_like(confidence)[:, None]), 1)
     places = segment_sum(of_tokens, row_of_token, m)
     places = places[:, :4] / places[:, 4:]
-    flags = segment_max(torch.stack((confidence, tokens.infrastructure.to(confidence.dtype)), 1), row_of_token, m)
+    extremes = torch.stack((confidence, tokens.infrastructure.to(confidence.dtype), tokens.age), 1)
+    flags = segment_max(extremes, row_of_token, m)
     masked = segment_max(features * tokens.selection_mask[:, None], row_of_token, m)
     present = distinct(
         torch.cat((tokens.ego * num_senders + tokens.sender, _egos(tokens, num_senders))),
@@ -173,7 +188,7 @@ def gather_by_cell(features: Tensor, tokens: Tokens, key: Tensor) -> tuple[CellR
     )[0]
     count = torch.bincount(present.div(num_senders, rounding_mode="floor"), minlength=tokens.batch_size)
     sites = Sites(keys, tokens.grid, tokens.batch_size)
-    columns_of_rows = (masked, cell, agent, flags[:, 0], flags[:, 1] > 0, places[:, :2], places[:, 2:])
+    columns_of_rows = (masked, cell, agent, flags[:, 0], flags[:, 1] > 0, places[:, :2], places[:, 2:], flags[:, 2])
     return CellRows(*columns_of_rows, sites, num_senders, count), row_of_token
 
 

@@ -2,11 +2,11 @@
 """V2X-ViT fusion (Xu et al., ECCV 2022, section 3.2) on sparse tokens: heterogeneous multi-agent attention, then
 multi-scale window attention.
 
-The paper uses dense maps of all agents; here agents attend to each other on the cells where their tokens are
-assigned. The paper's
-agent types are vehicle and roadside unit. A token does not name its sender's type, so the types here are ego and
-other. The
-delay-aware positional encoding is SpatioTemporalEncoding; the spatial warp is to_ego_frame.
+The paper uses dense maps of all agents; here an agent has one row on each cell where it has a token, agents attend to each other on
+a cell, and windows hold the rows of one agent. Agent types are vehicle and roadside unit. There are as many layers as the attention
+has blocks (paper: 3), without drop-out, and positions in windows are sines instead of a table. Inside, the delay-aware positional
+encoding is SpatioTemporalEncoding, layers end in zeros at the start, and the rows are merged by TokenMerge; bare, the encoding is
+that of the age alone, and the ego's row of every cell is the result.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from manyeyes.datatypes import ConfigError
+from manyeyes.datatypes import BevGrid, ConfigError
 from manyeyes.models.detector.transformer import AttentionConfig
-from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
+from manyeyes.models.fusion.by_cell import AbsentSenders, CellRows, gather_by_cell
+from manyeyes.models.fusion.cell_fusion import register_bare
+from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding, temporal_encoding
 from manyeyes.models.fusion.registry import register_fusion
 from manyeyes.models.fusion.token_merge import FusedBev, TokenMerge, assign_cells
 from manyeyes.models.fusion.transform_tokens import Tokens
@@ -24,7 +26,7 @@ from manyeyes.ops.voxelize import segment_sum
 from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_attention, window_ids, window_offsets
 
 NUM_AGENT_TYPES = 2
-"""Agent types: the ego's own tokens, and received tokens."""
+"""Agent types: vehicles, and roadside units."""
 
 
 class PerAgentType(nn.Module):
@@ -42,7 +44,7 @@ class PerAgentType(nn.Module):
 
 
 class AgentAttention(nn.Module):
-    """Heterogeneous attention between tokens of one cell: projections per agent type, and a matrix per head and edge
+    """Heterogeneous attention between the rows of one cell: projections per agent type, and a matrix per head and edge
     type in
     logits and messages.
 
@@ -58,10 +60,9 @@ class AgentAttention(nn.Module):
         d = channels // heads
         same = torch.eye(d, device="cpu").expand(NUM_AGENT_TYPES, NUM_AGENT_TYPES, heads, d, d)
         self.attention_matrix, self.message_matrix = nn.Parameter(same.clone()), nn.Parameter(same.clone())
-        _zero_init(self.out)
 
     def forward(self, features: Tensor, key: Tensor, agent_type: Tensor) -> Tensor:
-        """Map features (N, C) of agent types (N,) to (N, C); tokens with equal key (N,) attend to each other."""
+        """Map features (N, C) of agent types (N,) to (N, C); rows with equal key (N,) attend to each other."""
 
         def split(x: Tensor) -> Tensor:
             return x.unflatten(1, (self.heads, -1))
@@ -83,19 +84,18 @@ class AgentAttention(nn.Module):
 
 
 class WindowScale(nn.Module):
-    """Attention among the tokens of one agent in windows of one size."""
+    """Attention among the rows of one agent in windows of one size."""
 
     def __init__(self, channels: int, heads: int, window: int) -> None:
         super().__init__()
         self.heads, self.window = heads, window
         self.qkv, self.out = nn.Linear(channels, 3 * channels), nn.Linear(channels, channels)
-        _zero_init(self.out)
 
-    def forward(self, features: Tensor, tokens: Tokens, agent: Tensor) -> Tensor:
-        """Map features (N, C) of agents (N,) to (N, C)."""
-        cell, origin = tokens.grid.cell_size_m, (tokens.grid.x_min, tokens.grid.y_min)
-        ids = window_ids(tokens.xy, agent, origin, self.window * cell)
-        place = sincos_encoding(window_offsets(tokens.xy, origin, self.window * cell, cell), features.shape[1])
+    def forward(self, features: Tensor, xy: Tensor, agent: Tensor, grid: BevGrid) -> Tensor:
+        """Map features (N, C) at xy (N, 2), metres, of agents (N,) to (N, C)."""
+        cell, origin = grid.cell_size_m, (grid.x_min, grid.y_min)
+        ids = window_ids(xy, agent, origin, self.window * cell)
+        place = sincos_encoding(window_offsets(xy, origin, self.window * cell, cell), features.shape[1])
         # The position encoding enters queries and keys, not values.
         weight, bias = self.qkv.weight, self.qkv.bias
         query, key, value = (
@@ -120,19 +120,20 @@ class MultiScaleWindows(nn.Module):
             (config.heads // 2, config.window * 2),
         )
         self.scales = nn.ModuleList(WindowScale(channels, heads, window) for heads, window in shapes)
-        self.inner, self.outer = nn.Linear(channels, channels), nn.Linear(channels, len(shapes) * channels)
+        self.inner, self.norm = nn.Linear(channels, channels), nn.LayerNorm(channels)
+        self.outer = nn.Linear(channels, len(shapes) * channels)
 
-    def forward(self, features: Tensor, tokens: Tokens, agent: Tensor, agents: int) -> Tensor:
-        """Map features (N, C) of agents (N,) to (N, C); the last argument is the number of agents."""
-        scales = torch.stack([scale(features, tokens, agent) for scale in self.scales], 1)
+    def forward(self, features: Tensor, xy: Tensor, agent: Tensor, agents: int, grid: BevGrid) -> Tensor:
+        """Map features (N, C) at xy (N, 2), metres, of agents (N,) to (N, C); agents: the number of agents."""
+        scales = torch.stack([scale(features, xy, agent, grid) for scale in self.scales], 1)
         count = segment_sum(scales.new_ones(len(agent), 1), agent, agents).clamp_min(1)
         mean = segment_sum(scales.sum(1), agent, agents) / count
-        share = self.outer(torch.relu(self.inner(mean))).unflatten(1, (len(self.scales), -1)).softmax(1)
+        share = self.outer(torch.relu(self.norm(self.inner(mean)))).unflatten(1, (len(self.scales), -1)).softmax(1)
         return (share[agent] * scales).sum(1)
 
 
 class V2xVitLayer(nn.Module):
-    """One layer: agent attention, window attention, feed-forward network; pre-norm, residual, zero-initialised."""
+    """One layer: agent attention, window attention, feed-forward network; pre-norm, residual."""
 
     def __init__(self, channels: int, config: AttentionConfig) -> None:
         super().__init__()
@@ -142,51 +143,68 @@ class V2xVitLayer(nn.Module):
             MultiScaleWindows(channels, config),
         )
         hidden = channels * config.expansion
-        last = nn.Linear(hidden, channels)
-        self.ffn = nn.Sequential(nn.Linear(channels, hidden), nn.GELU(), last)
-        _zero_init(last)
+        self.ffn = nn.Sequential(nn.Linear(channels, hidden), nn.GELU(), nn.Linear(hidden, channels))
 
-    def forward(self, features: Tensor, tokens: Tokens, key: Tensor, agent_type: Tensor) -> Tensor:
-        """Map features (N, C) to (N, C)."""
+    def forward(self, rows: CellRows) -> CellRows:
+        """Return the rows with new features."""
         between, within, alone = self.norms
-        features = features + self.agent_attention(between(features), key, agent_type)
-        agent = tokens.ego * NUM_AGENT_TYPES + agent_type
-        features = features + self.window_attention(
-            within(features), tokens, agent, tokens.batch_size * NUM_AGENT_TYPES
+        agents, grid = rows.sites.batch_size * rows.num_senders, rows.sites.grid
+        features = rows.features
+        features = features + self.agent_attention(between(features), rows.cell, rows.infrastructure.long())
+        features = features + self.window_attention(within(features), rows.xy, rows.agent, agents, grid)
+        return rows.with_features(features + self.ffn(alone(features)))
+
+    def silence(self) -> None:
+        """Set the last layer of each branch to zero: the layer returns its input."""
+        last = [scale.get_submodule("out") for scale in self.window_attention.scales]
+        for module in (self.agent_attention.out, *last, self.ffn[2]):
+            for parameter in module.parameters():
+                nn.init.zeros_(parameter)
+
+
+def _make_layers(channels: int, config: AttentionConfig) -> list[V2xVitLayer]:
+    if config.heads % 2 or config.window % 2 or channels % (2 * config.heads):
+        raise ConfigError(
+            "V2X-ViT needs even heads and window, and channels divisible by twice the heads; got "
+            f"{config.heads}, {config.window} and {channels}."
         )
-        return features + self.ffn(alone(features))
+    return [V2xVitLayer(channels, config) for _ in range(config.blocks)]
 
 
 @register_fusion("v2x-vit")
 class V2xVitFusion(nn.Module):
-    """V2X-ViT layers, then TokenMerge with softmax weights as in the other fusions."""
+    """Mode inside: V2X-ViT layers on one row a sender and cell, then TokenMerge with softmax weights as in the other fusions."""
 
     def __init__(self, channels: int, config: AttentionConfig) -> None:
         super().__init__()
-        if config.heads % 2 or config.window % 2 or channels % (2 * config.heads):
-            raise ConfigError(
-                "V2xVitFusion needs even heads and window, and channels divisible by twice the heads; got "
-                f"{config.heads}, {config.window} and {channels}."
-            )
         self.encoding, self.merge = SpatioTemporalEncoding(channels), TokenMerge(channels, "softmax")
-        self.layers = nn.ModuleList(V2xVitLayer(channels, config) for _ in range(config.blocks))
+        layers = _make_layers(channels, config)
+        for layer in layers:
+            layer.silence()
+        self.layers = nn.ModuleList(layers)
 
     def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
         """Fuse the tokens of all agents to one feature and one box per cell; past is ignored."""
         key, place = assign_cells(tokens)
-        features, agent_type = self.encoding(tokens.features, tokens, place), agent_types(tokens)
+        rows, row_of_token = gather_by_cell(self.encoding(tokens.features, tokens, place), tokens, key)
         for layer in self.layers:
-            features = layer(features, tokens, key, agent_type)
-        return self.merge(features, tokens, key, place)
+            rows = layer(rows)
+        return self.merge(rows.features[row_of_token], tokens, key, place)
 
 
-def agent_types(tokens: Tokens) -> Tensor:
-    """Return the agent type (N,) int64 of tokens: 0 for the ego's current tokens (zero pose context), 1 for received
-    ones.
-    """
-    return tokens.pose_context.any(1).long()
+@register_bare("v2x-vit")
+class V2xVitRule(nn.Module):
+    """Mode bare: the encoding of delays and V2X-ViT layers; the ego's row of every cell, where it has no feature one of zeros."""
 
+    def __init__(self, channels: int, attention: AttentionConfig, absent: AbsentSenders) -> None:
+        super().__init__()
+        self.delay = nn.Linear(channels, channels, bias=False)
+        self.layers = nn.ModuleList(_make_layers(channels, attention))
 
-def _zero_init(module: nn.Module) -> None:
-    for parameter in module.parameters():
-        nn.init.zeros_(parameter)
+    def forward(self, rows: CellRows) -> Tensor:
+        """Fuse the rows to features (U, C) of the cells."""
+        full = rows.with_own_everywhere()
+        full = full.with_features(full.features + self.delay(temporal_encoding(full.age, full.features.shape[1])))
+        for layer in self.layers:
+            full = layer(full)
+        return full.own_features()
