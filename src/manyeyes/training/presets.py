@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from manyeyes.training.detector.fusion_presets import FUSION_PLANS, FUSION_TRAINING_PRESETS
 from manyeyes.training.detector.plan import TrainPlan
 from manyeyes.training.detector.presets import DETECTOR_PLANS, DETECTOR_TRAINING_PRESETS
 from manyeyes.training.maps.presets import MAP_TRAINING_PRESETS
@@ -11,9 +12,10 @@ from manyeyes.training.trainer import TrainConfig
 
 TRAINING_PRESETS: dict[str, TrainConfig] = {
     **DETECTOR_TRAINING_PRESETS,
+    **FUSION_TRAINING_PRESETS,
     **FEAKM_TRAINING_PRESETS,
     **MAP_TRAINING_PRESETS,
 }
 
-TRAINING_PLANS: dict[str, TrainPlan] = DETECTOR_PLANS
+TRAINING_PLANS: dict[str, TrainPlan] = {**DETECTOR_PLANS, **FUSION_PLANS}
 """Plans of several stages by name; no name is that of a preset of one stage."""

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
 
@@ -29,6 +29,7 @@ from manyeyes.training.detector.samples import AgentView, Sample
 from manyeyes.training.detector.targets import (
     BoxBatch,
     TargetConfig,
+    Targets,
     add_class_heat,
     assign_targets,
     find_nearby_objects,
@@ -39,6 +40,19 @@ TOKENS_PER_PACKET = 8
 
 _HISTORY_KEYS = {"ego_history": "past", "sender_history": "said"}
 """Parts of random keys; other values would change every training run."""
+
+
+@dataclass(frozen=True)
+class SingleAgentOutput:
+    """What each view gives by itself.
+
+    features: of all views. boxes: of all views. shared_tokens: of each view, on a batch of grids. score: (N,) of the selector.
+    """
+
+    features: ExtractedFeatures
+    boxes: RawBoxes
+    shared_tokens: SparseBev
+    score: Tensor
 
 
 @dataclass(frozen=True)
@@ -55,17 +69,22 @@ class ForwardOutput:
     mask: Tensor
 
 
+def forward_single(model: Detector, samples: list[Sample], prune_threshold: float | None = None) -> SingleAgentOutput:
+    """Encode every view as ego."""
+    views = [view for sample in samples for view in sample.views]
+    seen = model.extract_features([v.cloud for v in views], [v.previous_cloud for v in views], prune_threshold)
+    alone = model.predict(seen.tokens)
+    shared = model.make_tokens(seen.tokens, alone)
+    return SingleAgentOutput(seen, alone, shared, model.score_tokens(shared))
+
+
 def forward(model: Detector, samples: list[Sample], prune_threshold: float | None = None) -> ForwardOutput:
     """Encode every view as ego and fuse the shared tokens of every sample (CoSTr section III-A).
 
     Tokens are processed as in deployment: computed in the sender's frame, transformed metrically, fused, decoded.
     """
-    views = [view for sample in samples for view in sample.views]
-    seen = model.extract_features([v.cloud for v in views], [v.previous_cloud for v in views], prune_threshold)
-    alone = model.predict(seen.tokens)
-    shared = model.make_tokens(seen.tokens, alone)
-    score = model.score_tokens(shared)
-    mask = torch.sigmoid(score)
+    single = forward_single(model, samples, prune_threshold)
+    shared, score, mask = single.shared_tokens, single.score, torch.sigmoid(single.score)
     links = [
         _Link(ego, view, (*sample.key, i), is_own=not i)
         for ego, sample in enumerate(samples)
@@ -77,7 +96,7 @@ def forward(model: Detector, samples: list[Sample], prune_threshold: float | Non
     )
     tokens = to_ego_frame([*parts, *ego_history, *sender_history], shared.grid, len(samples))
     ego_past = to_ego_frame(ego_history, shared.grid, len(samples)) if ego_history else None
-    return ForwardOutput(seen, alone, model.fuse(tokens, ego_past)[1], shared, mask)
+    return ForwardOutput(single.features, single.boxes, model.fuse(tokens, ego_past)[1], shared, mask)
 
 
 @dataclass(frozen=True)
@@ -176,25 +195,50 @@ def loss_terms(
     """Compute the losses of one batch: fused boxes against the merged ground truth, single-agent boxes against each
     agent's own.
 
-    fusion_weight: fraction of the former. target: reference of the selector's mutual information.
+    fusion_weight: fraction of the former; at 0 nothing is fused. target: reference of the selector's mutual information.
     """
+    if fusion_weight == 0 and target == "own_task":
+        single = forward_single(model, samples, prune_threshold)
+        own = _single_terms(model, single, torch.sigmoid(single.score), samples, targets)
+        return heads_terms([own.head], *own.rest)[0]
     out = forward(model, samples, prune_threshold)
-    device = out.mask.device
-    listed_boxes = [view.visible_boxes for sample in samples for view in sample.views]
-    merged_boxes, classes = [sample.merged_gt_boxes for sample in samples], model.config.classes
-    listed, union = BoxBatch.of(listed_boxes, device), BoxBatch.of(merged_boxes, device)
-    found = ((pruned, find_nearby_objects(pruned.sites, listed, targets)) for pruned in out.features.pruned)
-    prune = torch.stack([prune_focal(pruned, near, len(listed.boxes)) for pruned, near in found]).mean()
-    sites = out.single_agent_boxes.sites
-    own = add_class_heat(assign_targets(sites, listed, targets), sites, listed_boxes, classes, targets)
-    kept, information = mutual_information_loss(out.shared_tokens, out.mask, own.heat)
+    single = SingleAgentOutput(out.features, out.single_agent_boxes, out.shared_tokens, out.mask)
+    own = _single_terms(model, single, out.mask, samples, targets)
     if target != "own_task":
-        information = STUDY_TARGETS[target](pair_agent_tokens(out, samples))
-    sites = out.fused_boxes.sites
-    both = add_class_heat(assign_targets(sites, union, targets), sites, merged_boxes, classes, targets)
-    heads = (out.single_agent_boxes, own), (out.fused_boxes, both)
-    alone, fused = heads_terms(heads, prune, kept, information)
+        own = replace(own, information=STUDY_TARGETS[target](pair_agent_tokens(out, samples)))
+    merged_boxes, sites = [sample.merged_gt_boxes for sample in samples], out.fused_boxes.sites
+    assigned = assign_targets(sites, BoxBatch.of(merged_boxes, out.mask.device), targets)
+    both = add_class_heat(assigned, sites, merged_boxes, model.config.classes, targets)
+    alone, fused = heads_terms((own.head, (out.fused_boxes, both)), *own.rest)
     return alone.mix(fused, fusion_weight)
+
+
+@dataclass(frozen=True)
+class _SingleTerms:
+    """Single-agent boxes with their targets, and the losses that no fusion changes."""
+
+    head: tuple[RawBoxes, Targets]
+    prune: Tensor
+    mask_l1: Tensor
+    information: Tensor
+
+    @property
+    def rest(self) -> tuple[Tensor, Tensor, Tensor]:
+        return self.prune, self.mask_l1, self.information
+
+
+def _single_terms(
+    model: Detector, single: SingleAgentOutput, mask: Tensor, samples: list[Sample], targets: TargetConfig
+) -> _SingleTerms:
+    """Assign the targets of single-agent boxes, and compute the losses of pruning and of the selector's mask (N,)."""
+    listed_boxes = [view.visible_boxes for sample in samples for view in sample.views]
+    listed = BoxBatch.of(listed_boxes, mask.device)
+    found = ((pruned, find_nearby_objects(pruned.sites, listed, targets)) for pruned in single.features.pruned)
+    prune = torch.stack([prune_focal(pruned, near, len(listed.boxes)) for pruned, near in found]).mean()
+    sites = single.boxes.sites
+    own = add_class_heat(assign_targets(sites, listed, targets), sites, listed_boxes, model.config.classes, targets)
+    kept, information = mutual_information_loss(single.shared_tokens, mask, own.heat)
+    return _SingleTerms((single.boxes, own), prune, kept, information)
 
 
 def pair_agent_tokens(out: ForwardOutput, samples: list[Sample]) -> AgentPairTokens:

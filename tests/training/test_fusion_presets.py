@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Presets of compared fusions: equal settings but for the fusion, and a base that every one of them starts from."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from manyeyes.models import checkpoint
+from manyeyes.models.detector.detector import Detector
+from manyeyes.models.fusion.registry import list_fusion_modules
+from manyeyes.training.detector.fusion_presets import (
+    BARE_FUSIONS,
+    FUSION_PLANS,
+    FUSION_TRAINING_PRESETS,
+    INSIDE_FUSIONS,
+    STEPS,
+    TABLE3_ROWS,
+)
+from manyeyes.training.detector.samples import AugmentConfig, DegradationConfig, make_sample
+from manyeyes.training.detector.step import loss_terms
+from manyeyes.training.detector.targets import TargetConfig
+from manyeyes.training.detector.task import DetectorTask
+
+BASES = {"fusion": "stage-a", **{f"table3/{name}": row.base for name, row in TABLE3_ROWS.items()}}
+
+
+def base_of(preset: str) -> str:
+    return BASES.get(preset, BASES["fusion"])
+
+
+def test_every_fusion_has_a_preset_in_its_modes() -> None:
+    own = {name for name in list_fusion_modules() if name != "own-mean"}
+    assert {name for name in own if not name.endswith("/bare")} == set(INSIDE_FUSIONS)
+    assert {f"{name}/bare" for name in BARE_FUSIONS} <= own
+
+
+def test_presets_differ_in_the_fusion_alone() -> None:
+    reference = FUSION_TRAINING_PRESETS["fusion/fast"]
+    assert reference.steps == STEPS == 2000
+    for name in INSIDE_FUSIONS:
+        config = FUSION_TRAINING_PRESETS[f"fusion/{name}"]
+        assert replace(config, detector=replace(config.detector, fusion="fast")) == reference
+    for name in BARE_FUSIONS:
+        config = FUSION_TRAINING_PRESETS[f"fusion/{name}/bare"]
+        assert config.degradation == replace(reference.degradation, ego_history=0)
+        rest = replace(config, degradation=reference.degradation, detector=reference.detector)
+        assert rest == reference
+
+
+@pytest.mark.parametrize("preset", FUSION_TRAINING_PRESETS)
+def test_a_preset_takes_every_tensor_of_its_base(preset: str, tmp_path) -> None:
+    base = Detector(FUSION_PLANS[base_of(preset)].stages[-1][1].detector)
+    path = tmp_path / "base.safetensors"
+    checkpoint.save(base, path, {})
+    model = DetectorTask(replace(FUSION_TRAINING_PRESETS[preset]), _Nothing(), start=path).make_model()
+    begun, state = base.state_dict(), model.state_dict()
+    assert begun.keys() <= state.keys()
+    assert all(torch.equal(state[name], value) for name, value in begun.items())
+    added = {name.split(".")[0] for name in state.keys() - begun.keys()}
+    assert added <= {"fusion", "refine"}
+
+
+class _Nothing:
+    """A recording that nothing is read of."""
+
+
+def test_the_base_is_trained_without_a_fusion(toy) -> None:
+    """The loss is that of single-agent boxes, whose gradient it is, too."""
+    config = FUSION_PLANS["stage-a"].stages[-1][1]
+    assert config.loss.fusion_weight == 0 and config.degradation == DegradationConfig()
+    assert sum(stage.steps for _, stage in FUSION_PLANS["stage-a"].stages) == 20600
+    torch.manual_seed(0)
+    model = Detector(replace(config.detector, fusion="fast"))
+    model.eval()
+    moments = [toy(agents_n=2, frames=3).snapshot("toy_0", i) for i in range(3)]
+    sample = make_sample(moments, 0, config.detector.grid, AugmentConfig.none(), ("a", 1))
+    alone, both = (loss_terms(model, [sample], TargetConfig(), 0.0, weight) for weight in (0.0, 1e-9))
+    for name, value in vars(alone).items():
+        assert torch.allclose(value, getattr(both, name), atol=1e-5), name
+    alone.total(config.loss).backward()
+    assert all(p.grad is None for p in model.fusion.parameters())
+    assert all(p.grad is not None for p in model.head.parameters())
