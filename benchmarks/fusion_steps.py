@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """CPU time of a training step of every fusion that is compared, parameters, and the hours of all runs that follow from it.
 
-Each preset starts from the shipped weights as far as they fit, in the middle of its run, where cells are pruned, with one thread. The
+Each preset starts from the shipped weights as far as they fit, in the middle of its run, where cells are pruned; one thread. The
 samples of a batch are the same for all presets. A step is draw, forward, backward, optimiser and moving average; the median counts.
 
 python benchmarks/fusion_steps.py --data FOLDER [--presets fusion/fast ...] [--steps 5] [--out benchmarks/results/fusion_steps.json]

@@ -84,7 +84,7 @@ def test_an_own_detector_alone_sends_nothing() -> None:
 
 def test_strategies_of_tokens_refuse_a_detector_of_boxes() -> None:
     needs_tokens = [name for name in list_strategies() if name.startswith("intermediate")]
-    assert len(needs_tokens) == 10
+    assert {"intermediate", "intermediate-multihop", "intermediate-where2comm"} <= set(needs_tokens)
     for name in needs_tokens:
         with pytest.raises(
             ConfigError, match="BlobDetector is a BoxDetector: it has no tokens, which intermediate fusion"

@@ -51,11 +51,18 @@ def compute_request_weights(
     return weights.amax(0).clamp_min(min_weight)
 
 
-def _request_weight(
+def read_request_map(
     xy: Tensor, world_from_sender: Transform, world_from_receiver: Transform, request: RequestMap
-) -> Tensor:
+) -> tuple[Tensor, Tensor]:
+    """Return the receiver's confidence (N,) at positions (N, 2), metres in the sender's frame, and whether they are on its map."""
     flat = torch.cat((xy, xy.new_zeros(len(xy), 1)), 1).double()
     there = (world_from_receiver.inverse() @ world_from_sender).apply(flat)[:, :2]
     yx = request.grid.cells(there)
-    weight = 1 - request.confidence[yx[:, 0], yx[:, 1]]
-    return torch.where(request.grid.contains(there), weight, 0.0).float()
+    return request.confidence[yx[:, 0], yx[:, 1]], request.grid.contains(there)
+
+
+def _request_weight(
+    xy: Tensor, world_from_sender: Transform, world_from_receiver: Transform, request: RequestMap
+) -> Tensor:
+    confidence, is_inside = read_request_map(xy, world_from_sender, world_from_receiver, request)
+    return torch.where(is_inside, 1 - confidence, 0.0).float()

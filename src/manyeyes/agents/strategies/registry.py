@@ -26,6 +26,7 @@ class FusionStrategy(Protocol):
         needs_tokens: it needs a TokenDetector.
         uses_points: it fuses the clouds of messages; packets of clouds are refused otherwise, since their decoding takes time.
         waits_for_messages: the ego answers when its latency budget has passed; false: at once, since it fuses no messages.
+        needs_request_map: its messages with tokens carry a request map, whatever the settings of the agent.
         score_form: form of its boxes, by which their scores are calibrated (``models.score_calibration``).
     """
 
@@ -33,6 +34,7 @@ class FusionStrategy(Protocol):
     needs_tokens: bool = False
     uses_points: bool = True
     waits_for_messages: bool = True
+    needs_request_map: bool = False
     score_form: ScoreForm = "own"
 
     def compose_message(

@@ -19,9 +19,20 @@ from manyeyes.training.detector.samples import DegradationConfig
 from manyeyes.training.detector.task import DetectorTrainConfig
 
 STEPS = 2000
-INSIDE_FUSIONS = ("fast", "attfuse", "v2vnet", "v2x-vit", "max", "disconet", "self-attention", "multi-scale")
+INSIDE_FUSIONS = (
+    "fast",
+    "attfuse",
+    "v2vnet",
+    "v2x-vit",
+    "max",
+    "disconet",
+    "where2comm",
+    "sparsealign",
+    "self-attention",
+    "multi-scale",
+)
 """Fusions in mode inside."""
-BARE_FUSIONS = ("max", "attfuse", "v2vnet", "v2x-vit", "disconet")
+BARE_FUSIONS = ("max", "attfuse", "v2vnet", "v2x-vit", "where2comm", "disconet", "sparsealign")
 """Fusions in mode bare: features alone are sent."""
 
 _FINAL = DETECTOR_TRAINING_PRESETS["costr-small/stage4"]

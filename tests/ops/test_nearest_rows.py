@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The nearest points of a set: order, range, scenes and too few points."""
+
+import torch
+
+from manyeyes.ops.nearest_rows import nearest_rows
+
+
+def test_nearest_points_come_first_and_far_ones_not_at_all() -> None:
+    """Points at 1, 3, 2 and 9 m of the origin, within 5 m; the other position has none."""
+    points = torch.tensor([[1.0, 0.0], [0.0, 3.0], [-2.0, 0.0], [9.0, 0.0]])
+    where = torch.tensor([[0.0, 0.0], [0.0, -40.0]])
+    scene = torch.zeros(4, dtype=torch.int64)
+    assert nearest_rows(where, scene[:2], points, scene, 2, 5.0).tolist() == [[0, 2], [-1, -1]]
+    assert nearest_rows(where, scene[:2], points, scene, 6, 5.0).tolist() == [[0, 2, 1, -1, -1, -1], [-1] * 6]
+
+
+def test_points_of_other_scenes_are_not_found() -> None:
+    points, where = torch.zeros(3, 2), torch.zeros(2, 2)
+    found = nearest_rows(where, torch.tensor([0, 1]), points, torch.tensor([1, 0, 1]), 2, 1.0)
+    assert found.tolist() == [[1, -1], [0, 2]]
+    assert nearest_rows(where[:0], torch.zeros(0), points, torch.zeros(3), 2, 1.0).shape == (0, 2)
