@@ -11,12 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.intermediate import IntermediateFusion, confidence_score
+from manyeyes.agents.strategies.intermediate_temporal import TemporalIntermediateFusion
 from manyeyes.agents.strategies.message_header import make_header
 from manyeyes.agents.strategies.registry import register_strategy
 from manyeyes.agents.strategies.request_maps import make_request_map
@@ -75,11 +77,20 @@ def _read(tokens: SparseBev, frame: AgentFrame, message: Message, request: Reque
     return KnownConfidence(message.agent_id, *read)
 
 
-@register_strategy("intermediate-codefilling")
 class CodeFillingFusion(IntermediateFusion):
     """Tokens by confidence, as far as they fill a demand; each message carries a request map."""
 
     needs_request_map = True
 
-    def __init__(self) -> None:
-        super().__init__(score=confidence_score, weigh=weigh_by_filling)
+
+class TemporalCodeFillingFusion(TemporalIntermediateFusion):
+    """The same with memory."""
+
+    needs_request_map = True
+
+
+for name, strategy in (
+    ("intermediate-codefilling", CodeFillingFusion),
+    ("intermediate-codefilling-temporal", TemporalCodeFillingFusion),
+):
+    register_strategy(name)(partial(strategy, score=confidence_score, weigh=weigh_by_filling))

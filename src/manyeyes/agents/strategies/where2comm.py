@@ -15,6 +15,7 @@ from torch import Tensor
 
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.intermediate import IntermediateFusion, confidence_score
+from manyeyes.agents.strategies.intermediate_temporal import TemporalIntermediateFusion
 from manyeyes.agents.strategies.registry import register_strategy
 from manyeyes.comms.request_map import compute_request_weights
 from manyeyes.datatypes import AgentFrame, Message, SparseBev
@@ -50,6 +51,14 @@ class Where2commFusion(IntermediateFusion):
     needs_request_map = True
 
 
-register_strategy("intermediate-where2comm")(
-    partial(Where2commFusion, score=smoothed_confidence, weigh=weigh_by_demand)
-)
+class TemporalWhere2commFusion(TemporalIntermediateFusion):
+    """The same with memory."""
+
+    needs_request_map = True
+
+
+for name, strategy in (
+    ("intermediate-where2comm", Where2commFusion),
+    ("intermediate-where2comm-temporal", TemporalWhere2commFusion),
+):
+    register_strategy(name)(partial(strategy, score=smoothed_confidence, weigh=weigh_by_demand))
