@@ -294,7 +294,7 @@ def test_a_file_that_no_run_wrote_is_not_repaired(folder: Path, capsys: pytest.C
 def test_a_full_disk_leaves_no_half_written_scenario(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def fill(scenario: object, draft: Path) -> int:
+    def fill(job: object, scenario: object, draft: Path) -> int:
         limit = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (10, limit[1]))
         try:

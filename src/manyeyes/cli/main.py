@@ -24,6 +24,7 @@ COMMANDS = {
     "calibrate": "calibrate the scores of trained weights, and with them the score from which boxes are drawn",
     "evaluate": "evaluate methods on a split: AP with intervals, bytes, paired differences",
     "replay": "replay your own recording as demo does",
+    "export": "export detections to the result files of KITTI or nuScenes",
     "view": "draw a frame of a recording, or animate a drive",
     "pose": "evaluate pose correction from detected objects: prior and corrected poses",
     "map": "one map from many drives: build, simulate, fuse, evaluate, diff, export, view, import, retract",

@@ -88,6 +88,7 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
     "calibrate": (),
     "evaluate": (),
     "replay": (Requirement("view", EXTRAS["view"]),),
+    "export": (),
     "view": (_PILLOW,),
     "pose": (_GICP,),
     "doctor": (),

@@ -18,6 +18,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 import torch
 
+from manyeyes.datasets.kitti.result_files import KittiCalibration, read_calibration, read_camera_pose
 from manyeyes.datasets.kitti.text_files import (
     REMEDY,
     parse_numbers,
@@ -82,11 +83,11 @@ class ObjectFrame:
         path, calibration = self.folder / "label_2" / f"{self.stem}.txt", self.folder / "calib" / f"{self.stem}.txt"
         if not path.is_file():
             return None
-        rectified = np.eye(4)
-        rectified[:3, :3] = read_matrix(calibration, "R0_rect", "R_rect", shape=(3, 3))
-        camera = np.eye(4)
-        camera[:3] = read_matrix(calibration, "Tr_velo_to_cam", "Tr_velo_cam", shape=(3, 4))
-        return read_labels(path, to_motion(calibration, (rectified @ camera)[:3], "R0_rect Tr_velo_to_cam").inverse())
+        return read_labels(path, read_camera_pose(calibration).inverse())
+
+    def calibration(self) -> KittiCalibration:
+        """Return the camera that labels and results of the frame belong to."""
+        return read_calibration(self.folder / "calib" / f"{self.stem}.txt")
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from manyeyes.datasets.kitti.drives import (
     RawDrive,
     list_clouds,
 )
+from manyeyes.datasets.kitti.result_files import KittiCalibration
 from manyeyes.datasets.lidar_frame import make_lidar_frame, merge_listed_boxes
 from manyeyes.datasets.missing import FileProblem
 from manyeyes.datasets.registry import register_dataset
@@ -97,6 +98,11 @@ class KittiRecording(RecordingReader):
         )
         truth = None if listed is None else merge_listed_boxes([listed.transform(world_from_lidar)], [frame])
         return Snapshot(scenario, index, (frame,), truth)
+
+    def calibration(self, scenario: str) -> KittiCalibration | None:
+        """Return the camera of a frame of object detection, which results are exported for; None of other drives."""
+        drive = self._drive(scenario)
+        return drive.calibration() if isinstance(drive, ObjectFrame) else None
 
     def _drive(self, scenario: str) -> Drive:
         if scenario not in self._drives:
