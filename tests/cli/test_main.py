@@ -41,7 +41,7 @@ def test_an_unknown_command_lists_the_known(capsys) -> None:
     assert cli.main(["demmo"]) == 2
     assert capsys.readouterr().err == (
         "manyeyes: there is no command 'demmo'; did you mean demo? Known commands: "
-        "demo, check, simulate, train, finetune, fit-codebook, calibrate, evaluate, replay, export, view, pose, map, study, "
+        "demo, check, simulate, train, finetune, fit-codebook, calibrate, evaluate, replay, export, view, pose, map, keys, study, "
         "doctor.\n"
     )
 

@@ -33,8 +33,7 @@ class Options(EvaluationOptions):
     """Evaluate every agent as ego, not only the first."""
     thresholds: Path | None = None
     """results.json of 'manyeyes evaluate' on a validation split, whose thresholds of greatest F give precision and recall; by
-    default those of the card of the weights.
-    """
+    default those of the card of the weights."""
     timing_frames: NonNegativeInt = 10
     """Frames of the first scenario on which each method is timed by itself; 0 leaves times out."""
 

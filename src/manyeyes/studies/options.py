@@ -43,8 +43,7 @@ class EvaluationOptions(RecordingStudyOptions):
 
     protocol: str = "global-sort"
     """Evaluation protocol: global-sort, opencood, coalign, sparsealign; on OPV2V also coalign-opv2v, heal-opv2v; on DAIR-V2X
-    dair, dair-3d, heal-dair, costr-dair, costr-dair-centred, sparsealign-dair.
-    """
+    dair, dair-3d, heal-dair, costr-dair, costr-dair-centred, sparsealign-dair."""
     object_class: Literal["vehicle", "pedestrian", "cyclist"] | None = None
     """The class whose numbers are computed; by default all that the weights detect in 'evaluate', the first of them in a study."""
     workers: WorkerCount = os.cpu_count() or 1
