@@ -11,8 +11,11 @@ has a 95 % interval by a bootstrap over instants. A stage's time excludes the st
 
 The wide case runs the present version alone on 64 beams and OPV2V's range, in turn with a6c4d23 on 16 beams of the same scenes.
 
+``--methods NAME ...`` times the step of the present version with each strategy instead, on 16 beams and without pose correction; so
+are the constants of ``evaluation/detection/compute_times.toml`` made.
+
 python benchmarks/step.py [--baseline COMMIT or FOLDER] [--drives 2] [--instants 12] [--cases NAME ...] [--wide-weights NAME]
-    [--recordings FOLDER] [--out benchmarks/results/step.json]
+    [--recordings FOLDER] [--methods NAME ...] [--out benchmarks/results/step.json]
 """
 
 from __future__ import annotations
@@ -353,6 +356,55 @@ def show(row: Row) -> None:
             print(f"  {name:<36} {old:8.2f} {new:8.2f} ms")
 
 
+@dataclass(frozen=True)
+class MethodRow:
+    """CPU milliseconds of an agent's step with one strategy, and those of its parts, means over agents and instants."""
+
+    method: str
+    agents: float
+    instants: int
+    step_ms: float
+    share_ms: float
+    perceive_ms: float
+
+
+def time_method(method: str, snapshots: Snapshots, instants: int) -> MethodRow:
+    """Time one strategy on a drive; histories are full when times count."""
+    from manyeyes import Agent, get_strategy
+    from manyeyes.models import pretrained
+
+    detector, spent = pretrained.load("costr-small"), {"share": 0.0, "perceive": 0.0}
+    agents = [Agent(detector, get_strategy(method)) for _ in snapshots[0]]
+    for number, frames in enumerate(snapshots[: WARMUP_FRAMES + instants]):
+        counts, packets = number >= WARMUP_FRAMES, []
+        began = time.process_time()
+        for agent, frame in zip(agents, frames):
+            packets.append(agent.share(frame))
+        shared = time.process_time()
+        for n, (agent, frame) in enumerate(zip(agents, frames)):
+            agent.perceive(frame, [packet for m, sent in enumerate(packets) if m != n for packet in sent])
+        spent["share"] += counts * (shared - began)
+        spent["perceive"] += counts * (time.process_time() - shared)
+    share_ms, perceive_ms = (1e3 * spent[step] / (instants * len(agents)) for step in STEPS)
+    return MethodRow(method, len(agents), instants, share_ms + perceive_ms, share_ms, perceive_ms)
+
+
+def time_methods(methods: Sequence[str], instants: int, recordings: Path | None, out: Path | None) -> None:
+    """Time strategies one after the other on the first drive; the row of "other" is the slowest."""
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as spare:
+        snapshots = simulate_drives(16, 1, recordings or Path(spare))[0]
+    time_method(methods[0], snapshots, 1)  # compiles loops
+    rows = []
+    for method in methods:
+        rows.append(time_method(method, snapshots, instants))
+        print(f"{method:<32} {rows[-1].step_ms:6.1f} ms", flush=True)
+    if out:
+        settings = {"drives": 1, "instants": instants, "threads": 1, "beams": 16, "weights": "costr-small"}
+        command = shlex.join(["python", *sys.argv])
+        write_json(out, {"command": command, "settings": settings, "rows": rows}, settings, seed=0)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--baseline", default="a6c4d23")
@@ -361,8 +413,12 @@ def main() -> None:
     parser.add_argument("--cases", nargs="*", default=[case.name for case in CASES])
     parser.add_argument("--wide-weights", default="costr-small")
     parser.add_argument("--recordings", type=Path)
+    parser.add_argument("--methods", nargs="*", default=[])
     parser.add_argument("--out", type=Path)
     wanted = parser.parse_args()
+    if wanted.methods:
+        time_methods(wanted.methods, wanted.instants, wanted.recordings, wanted.out)
+        return
     torch.set_num_threads(1)
     cases = [replace(c, weights=wanted.wide_weights) if c.is_wide else c for c in CASES if c.name in wanted.cases]
     rows: list[Row] = []

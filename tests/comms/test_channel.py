@@ -213,7 +213,7 @@ def test_misuse_is_named():
     bus.publish(1, HERE, [bytes(10)], 10)
     with pytest.raises(ConfigError, match="in order of time"):
         bus.publish(1, HERE, [bytes(10)], 9)
-    with pytest.raises(ConfigError, match="known are ideal, its-g5, its-g5-27mbps, lte-v2x, nr-sidelink, cellular"):
+    with pytest.raises(ConfigError, match="known are ideal, its-g5-6, its-g5-27mbps, lte-v2x, nr-sidelink, cellular"):
         channel_preset("pigeon")
 
 
@@ -239,3 +239,7 @@ def test_agents_that_left_are_forgotten():
         medium.offer(Transmission(number, HERE, packets(1), number * MS))
         assert len(medium.run((number + 0.5) * MS)) == 1
     assert len(medium._numbered) <= 1
+
+
+def test_a_former_name_of_a_preset_is_read() -> None:
+    assert channel_preset("its-g5") is channel_preset("its-g5-6") and channel_preset("its-g5-6").rate_bps == 6e6

@@ -15,6 +15,7 @@ from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, GroundTruth, Poin
 from manyeyes.evaluation.detection import benchmark
 from manyeyes.evaluation.detection.accumulator import MetricAccumulator
 from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, run_scenario
+from manyeyes.evaluation.detection.compute_times import compute_time_s
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
@@ -131,6 +132,27 @@ def test_robustness_has_a_row_per_perturbation_and_method(data, weights, tmp_pat
         "late": (0, 0.1, 0.4),
         "intermediate": (0, 0.1, 0.4),
     }
+
+
+@pytest.mark.slow
+def test_the_main_table_judges_both_forms_at_sweep_and_answer(data, weights, tmp_path) -> None:
+    methods = ("no-fusion", "late", "late-temporal", "no-fusion-temporal")
+    words = ("--frame-stride", 2, "--perturbations", "0.8 m", "--channels", "its-g5-6", "--methods", *methods)
+    common = ("--data", data, "--split", "test", "--weights", weights, "--workers", 1, "--out", tmp_path)
+    assert cli.main([str(word) for word in ("study", "main-table", *common, *words)]) == 0
+    held = json.loads((tmp_path / "main-table.json").read_text())
+    rows = {(r["channel"], r["perturbation"]["position_sigma_m"], r["method"]): r for r in held["result"]["rows"]}
+    assert set(rows) == {
+        *(("any channel", 0.0, m) for m in methods if m.startswith("no")),
+        *(("its-g5-6", s, m) for s in (0.0, 0.8) for m in methods if m.startswith("late")),
+    }
+    late, alone = rows["its-g5-6", 0.0, "late"], rows["any channel", 0.0, "no-fusion"]
+    assert late["answer_ms"] == pytest.approx(100 + 1e3 * compute_time_s("late"))
+    assert alone["answer_ms"] == pytest.approx(1e3 * compute_time_s("no-fusion"))
+    noise = [c["config"]["pose_noise"] for c in held["provenance"]["config"]["config"]["conditions"]]
+    assert {n["claim"] for n in noise if n} == {"none"} and {n["in_time"] for n in noise if n} == {"autoregressive"}
+    text = (tmp_path / "main-table.md").read_text()
+    assert "claimed covariance: none" in text and "random walk of 0.02 m" in text and "AP@0.7 at answer" in text
 
 
 @pytest.mark.slow

@@ -91,7 +91,11 @@ class SentPackets:
 
 @dataclass(frozen=True)
 class ReplayStep:
-    """One ego at one instant with one method. ages_s: of every fused message at the time of perception."""
+    """One ego at one instant with one method.
+
+    ages_s: of every fused message at the time of perception. wait_s: from the ego's sweep to that time; 0 with a strategy
+    that fuses no messages.
+    """
 
     method: str
     snapshot: Snapshot
@@ -100,6 +104,7 @@ class ReplayStep:
     sent: tuple[SentPackets, ...]
     ages_s: tuple[float, ...]
     perceive_seconds: float
+    wait_s: float = 0.0
 
     @property
     def boxes(self) -> Boxes:
@@ -147,7 +152,8 @@ class DetectionReplay:
                 if rejection.cause is not None:
                     raise rejection.cause
             ages = tuple(message.age_ns(deadline_ns) / 1e9 for message in perception.received)
-            yield ReplayStep(self.method, snapshot, ego, perception, sent, ages, took)
+            wait_s = self.config.latency_budget_s if self._agent(frame.agent_id).strategy.waits_for_messages else 0.0
+            yield ReplayStep(self.method, snapshot, ego, perception, sent, ages, took, wait_s)
 
     def _share(self, frames: Sequence[AgentFrame]) -> list[tuple[list[bytes], float]]:
         """Compose the packets of all agents, within the budget of the channel; with the duration of share in seconds."""

@@ -120,6 +120,7 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
     "keys revoke": (_CRYPTOGRAPHY,),
     "keys trust": (_CRYPTOGRAPHY,),
     "keys demo": (_CRYPTOGRAPHY,),
+    "study main-table": (),
     "study robustness": (_MATPLOTLIB,),
     "study bandwidth": (_MATPLOTLIB,),
     "study shared-bandwidth": (_MATPLOTLIB,),

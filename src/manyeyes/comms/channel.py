@@ -81,7 +81,7 @@ class ChannelPreset:
 CHANNELS: tuple[ChannelPreset, ...] = (
     ChannelPreset("ideal", math.inf),
     ChannelPreset(
-        "its-g5",
+        "its-g5-6",
         6e6,
         per_packet_overhead_bytes=195,
         busy_ratio_limit=0.6,
@@ -132,10 +132,14 @@ CHANNELS: tuple[ChannelPreset, ...] = (
 )
 
 
+FORMER_NAMES = {"its-g5": "its-g5-6"}
+"""Names of presets in stored commands and results, with today's."""
+
+
 def channel_preset(name: str) -> ChannelPreset:
-    """Return the preset of that name from CHANNELS."""
+    """Return the preset of that name from CHANNELS, or of a name that it had."""
     for preset in CHANNELS:
-        if preset.name == name:
+        if preset.name == FORMER_NAMES.get(name, name):
             return preset
     raise ConfigError(f"There is no channel {name!r}; known are {', '.join(p.name for p in CHANNELS)}.")
 

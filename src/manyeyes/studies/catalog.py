@@ -26,6 +26,9 @@ class Study:
 _DETECTION, _POSE = "detection (CoSTr)", "pose correction (FeaKM)"
 _MODEL, _FLEET = "map model (CrowdMap)", "map fusion of simulated fleets"
 STUDIES = {
+    "main-table": Study(
+        _DETECTION, "every method with and without memory, on a real and the ideal channel, each disturbance",
+        "detection.main_table", "MainTableOptions"),
     "robustness": Study(
         _DETECTION, "delay, pose noise and packet loss, one at a time and combined (Table II)",
         "detection.robustness", "RobustnessOptions"),

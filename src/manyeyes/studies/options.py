@@ -10,7 +10,7 @@ from typing import Literal
 
 from manyeyes._bounds import AngleDeg, ByteCount, OutputFolder, PositiveInt, Seed, TrialCount, WorkerCount
 from manyeyes.studies.pose_error_options import PoseErrorOptions
-from manyeyes.studies.replay_options import FileChecks, ReplayOptions
+from manyeyes.studies.replay_options import BOTH_FORMS, FileChecks, ReplayOptions
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,6 +62,18 @@ class RobustnessOptions(EvaluationOptions):
     """Perturbations by the names of the tables, such as "0.4 s" "30 % loss"; by default all."""
     checkpoints: tuple[str, ...] = ()
     """Baselines beside the methods, as name=weights.safetensors."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MainTableOptions(EvaluationOptions):
+    """Options of the study main-table, whose channels take the place of --channel and --latency-budget-ms."""
+
+    replay_options: ReplayOptions = field(default_factory=lambda: ReplayOptions(methods=BOTH_FORMS))
+    """How agents collaborate."""
+    channels: tuple[str, ...] = ("its-g5-6", "ideal")
+    """Channels, one table each; the ego waits 100 ms for messages, on the ideal one 0."""
+    perturbations: tuple[str, ...] = ()
+    """Perturbations by the names of the tables, such as "0.8 m"; by default clean, 0.4 s, 0.8°, 0.8 m, 30 % loss, all together."""
 
 
 @dataclass(frozen=True, kw_only=True)

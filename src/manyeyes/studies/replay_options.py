@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from manyeyes._bounds import ByteCount, DurationMs
-from manyeyes.agents.strategies.names import current_name
+from manyeyes.agents.strategies.names import TEMPORAL, current_name
 from manyeyes.datatypes import ConfigError
 
 if TYPE_CHECKING:
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from manyeyes.datatypes import Snapshot
 
 ALL_METHODS = ("no-fusion", "late", "intermediate", "early")
+BOTH_FORMS = tuple(
+    name + form for form in ("", TEMPORAL) for name in ("no-fusion", "late", "late-weighted", "intermediate", "early")
+)
 FRAME_PERIOD_MS = 100.0
 IDEAL_LATENCY_BUDGET_MS = 0.0
 
@@ -30,7 +33,7 @@ class ReplayOptions:
     methods: tuple[str, ...] = ALL_METHODS
     """What is compared: strategies by name, NAME-temporal with memory, those of your own too; an unknown name lists them."""
     channel: str = "ideal"
-    """The channel between agents: ideal, its-g5, its-g5-27mbps, lte-v2x, nr-sidelink, cellular."""
+    """The channel between agents: ideal, its-g5-6 (6 Mb/s), its-g5-27mbps, lte-v2x, nr-sidelink, cellular."""
     latency_budget_ms: DurationMs | None = None
     """How long an ego waits for messages after its own sweep; by default 0 on the ideal channel, else one period, 100."""
     budget_bytes: ByteCount = 1 << 17

@@ -15,6 +15,7 @@ from manyeyes.evaluation.detection.protocols import DetectionProtocol
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.evaluation.statistics.comparison import Comparison, compare_methods
 from manyeyes.evaluation.statistics.operating_point import OperatingPoint
+from manyeyes.viz.answer_table import NOTE, AnswerRow, format_answer_markdown, make_answer_rows, make_answer_table
 from manyeyes.viz.operating_table import (
     OperatingRow,
     format_operating_markdown,
@@ -69,7 +70,7 @@ class MethodStats:
 @dataclass(frozen=True)
 class MethodComparison:
     """Comparison of methods. protocol: rules and range of AP. missing: missing files of the recording. operating_rows: methods at
-    their score thresholds.
+    their score thresholds. answer_rows: methods at the time of their answer.
     """
 
     protocol: DetectionProtocol
@@ -78,6 +79,7 @@ class MethodComparison:
     differences: tuple[Comparison, ...]
     missing: MissingFiles = NONE_MISSING
     operating_rows: tuple[OperatingRow, ...] = ()
+    answer_rows: tuple[AnswerRow, ...] = ()
 
     @property
     def footer(self) -> str:
@@ -97,7 +99,8 @@ def summarize_comparison(
     stats = tuple(map(_summarize_method, results))
     rows = tuple(make_row(result) for result in results)
     differences = compare_methods(results, protocol)
-    return MethodComparison(protocol, stats, rows, differences, missing, make_operating_rows(results))
+    operating_rows, answer_rows = make_operating_rows(results), make_answer_rows(results)
+    return MethodComparison(protocol, stats, rows, differences, missing, operating_rows, answer_rows)
 
 
 def _summarize_method(result: MethodResult) -> MethodStats:
@@ -127,6 +130,10 @@ def print_comparison(console: Console, comparison: MethodComparison, title: str)
         console.print(make_operating_table(comparison.operating_rows))
         note = format_operating_note(comparison.operating_rows, comparison.protocol.score_threshold)
         console.print(note, highlight=False, soft_wrap=True)
+    if comparison.answer_rows:
+        console.print()
+        console.print(make_answer_table(comparison.answer_rows))
+        console.print(NOTE, highlight=False, soft_wrap=True)
     if comparison.footer:
         console.print(comparison.footer, highlight=False, soft_wrap=True)
     if comparison.has_several_scenarios and comparison.differences:
@@ -139,6 +146,8 @@ def format_comparison_markdown(comparison: MethodComparison) -> str:
     parts = [format_markdown(comparison.rows)]
     if comparison.operating_rows:
         parts.append(format_operating_markdown(comparison.operating_rows, comparison.protocol.score_threshold))
+    if comparison.answer_rows:
+        parts.append(format_answer_markdown(comparison.answer_rows))
     if comparison.differences:
         parts.append(
             format_markdown_lines([DIFFERENCE_HEADINGS, *map(format_difference_cells, comparison.differences)])

@@ -44,7 +44,7 @@ class Options:
     frame_stride: PositiveInt = 5
     """Use every n-th frame."""
     channel: str = "ideal"
-    """The channel between agents: ideal, its-g5, its-g5-27mbps, lte-v2x, nr-sidelink, cellular."""
+    """The channel between agents: ideal, its-g5-6 (6 Mb/s), its-g5-27mbps, lte-v2x, nr-sidelink, cellular."""
     pose_sigma: LengthM = 0.0
     """Standard deviation of errors added to prior positions, metres; headings err in proportion, 1 degree a metre."""
     map: Path | None = None

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from manyeyes.agents.replay import ReplayStep
 from manyeyes.datatypes import VEHICLES
+from manyeyes.evaluation.detection.answer_time import Answer
 from manyeyes.evaluation.detection.average_precision import (
     ApResult,
     compute_ap,
@@ -42,6 +43,8 @@ class MethodResult:
 
     ap, intervals and legacy_intervals (of the AP over concatenated frames): one an IoU threshold, in the order of IOU_THRESHOLDS.
     operating_point: at the first of them. best_threshold: the score of greatest F there, for an evaluation of other data.
+    answer_ap, answer_intervals: the same at the time of the answer, and answer_ms the mean time from sweep to answer; empty and NaN
+    where that was not judged.
     """
 
     method: str
@@ -55,6 +58,9 @@ class MethodResult:
     legacy_intervals: tuple[Interval, ...] = ()
     operating_point: OperatingPoint | None = None
     best_threshold: float | None = None
+    answer_ap: tuple[ApResult, ...] = ()
+    answer_intervals: tuple[Interval, ...] = ()
+    answer_ms: float = math.nan
 
     def paired_difference(self, other: MethodResult, iou: int, protocol: DetectionProtocol) -> Interval:
         """Return the AP of this method minus that of another, paired over scenarios. iou: index into IOU_THRESHOLDS."""
@@ -78,9 +84,11 @@ class MetricAccumulator:
     ages_s: list[float] = field(default_factory=list)
     share_s: list[float] = field(default_factory=list)
     perceive_s: list[float] = field(default_factory=list)
+    answer_frames: list[FrameIou] = field(default_factory=list)
+    answer_s: list[float] = field(default_factory=list)
 
-    def add(self, step: ReplayStep) -> None:
-        """Count one ego at one instant."""
+    def add(self, step: ReplayStep, answer: Answer | None = None) -> None:
+        """Count one ego at one instant; answer: what it is at the time of the answer, if that is judged too."""
         snapshot, ego = step.snapshot, step.snapshot.frames[step.ego].agent_id
         truth = select_ego_truth(snapshot, step.ego, self.protocol)
         result = FrameResult(snapshot.scenario, snapshot.index, step.boxes, truth)
@@ -99,6 +107,11 @@ class MetricAccumulator:
                 self.messages.append(record)
         self.ages_s += step.ages_s
         self.perceive_s.append(step.perceive_seconds)
+        if answer is not None:
+            truth = select_ego_truth(answer.snapshot, answer.ego, self.protocol)
+            moved = FrameResult(snapshot.scenario, snapshot.index, answer.boxes, truth)
+            self.answer_frames += compute_frame_ious(moved, self.protocol)
+            self.answer_s.append(answer.seconds)
 
     def extend(self, other: MetricAccumulator) -> None:
         """Count what another tally of this method counted."""
@@ -108,13 +121,26 @@ class MetricAccumulator:
         self.ages_s += other.ages_s
         self.share_s += other.share_s
         self.perceive_s += other.perceive_s
+        self.answer_frames += other.answer_frames
+        self.answer_s += other.answer_s
 
     def match_frames(self) -> tuple[tuple[FrameMatch, ...], ...]:
         """Return the frames, of all classes, matched at each of IOU_THRESHOLDS, in the order they came in."""
+        return self._match(self.frames)
+
+    def match_answers(self) -> tuple[tuple[FrameMatch, ...], ...]:
+        """Return the same at the time of the answer; nothing where that was not judged."""
+        return self._match(self.answer_frames) if self.answer_frames else ()
+
+    def _match(self, frames: Sequence[FrameIou]) -> tuple[tuple[FrameMatch, ...], ...]:
         return tuple(
-            tuple(match_frame(frame, iou, self._protocol_of(frame.class_name)) for frame in self.frames)
+            tuple(match_frame(frame, iou, self._protocol_of(frame.class_name)) for frame in frames)
             for iou in IOU_THRESHOLDS
         )
+
+    def mean_answer_ms(self) -> float:
+        """Return the mean time from sweep to answer; NaN where that was not judged."""
+        return _mean_ms(self.answer_s)
 
     def _protocol_of(self, class_name: str) -> DetectionProtocol:
         return self.protocol.with_classes((class_name,))
@@ -143,18 +169,25 @@ class MetricAccumulator:
 
         thresholds: by class; DEFAULT_THRESHOLD of those that it lacks.
         """
-        matched = self.match_frames()
+        matched, answers = self.match_frames(), self.match_answers()
         return tuple(
-            self._compute_class(name, matched, (thresholds or {}).get(name, DEFAULT_THRESHOLD))
+            self._compute_class(name, matched, answers, (thresholds or {}).get(name, DEFAULT_THRESHOLD))
             for name in self.protocol.classes
         )
 
     def _compute_class(
-        self, name: str, matched: Sequence[Sequence[FrameMatch]], threshold: OperatingThreshold
+        self,
+        name: str,
+        matched: Sequence[Sequence[FrameMatch]],
+        answers: Sequence[Sequence[FrameMatch]],
+        threshold: OperatingThreshold,
     ) -> MethodResult:
         protocol = self._protocol_of(name)
         legacy = replace(protocol, ap_order="concatenated")
-        matches = [[match for match in column if match.class_name == name] for column in matched]
+        matches, moved = (
+            [[match for match in column if match.class_name == name] for column in columns]
+            for columns in (matched, answers)
+        )
         return MethodResult(
             self.method,
             tuple(compute_ap(m, protocol) for m in matches),
@@ -167,6 +200,9 @@ class MetricAccumulator:
             tuple(bootstrap(m, protocol=legacy).interval() for m in matches),
             compute_operating_point(matches[0], threshold, protocol),
             find_best_threshold(matches[0], protocol),
+            tuple(compute_ap(m, protocol) for m in moved),
+            tuple(bootstrap(m, protocol=protocol).interval() for m in moved),
+            self.mean_answer_ms(),
         )
 
 

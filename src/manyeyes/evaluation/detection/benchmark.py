@@ -23,6 +23,7 @@ from manyeyes.datasets.odometry_drift import DriftingOdometry, OdometryDrift
 from manyeyes.datasets.perturbation import PoseNoise
 from manyeyes.datatypes import VEHICLES, ConfigError, Snapshot
 from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS, MethodResult, MetricAccumulator
+from manyeyes.evaluation.detection.answer_time import answer_of
 from manyeyes.evaluation.detection.protocols import DetectionProtocol, get_protocol
 from manyeyes.evaluation.detection.recording_filters import CachedRecording, FrameStride, NearestAgents
 from manyeyes.evaluation.detection.sensor_change import NO_SENSOR_CHANGE, SensorChange
@@ -141,7 +142,7 @@ def run_scenario(
     for instants in zip(*replays):
         for (_, steps), accumulators in zip(instants, accumulators_by_config):
             for step in steps:
-                accumulators[step.method].add(step)
+                accumulators[step.method].add(step, answer_of(step, recording))
     return [list(accumulators.values()) for accumulators in accumulators_by_config]
 
 

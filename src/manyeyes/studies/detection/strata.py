@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from manyeyes.agents.strategies.names import form_of
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.evaluation.statistics.comparison import Comparison
 from manyeyes.studies.engine.conditions import Condition, ResultGrid
-from manyeyes.studies.engine.replay_study import NO_FUSION, OURS
+from manyeyes.studies.engine.replay_study import ALONE, FORMS, OURS
 from manyeyes.studies.engine.report import StudyContext
 from manyeyes.studies.engine.several_recordings import join_name, prepare_recordings
 from manyeyes.studies.options import StrataOptions
@@ -82,11 +83,12 @@ def make_comparisons(results: ResultGrid, strata: Sequence[str]) -> tuple[Compar
     out: list[Comparison] = []
     for stratum in strata:
         condition = join_name(stratum, _CONDITION)
-        others = [method for name, method in results.results if name == condition and method != OURS]
-        if (condition, OURS) in results.results:
+        methods = [method for name, method in results.results if name == condition]
+        for ours in (OURS + form for form in FORMS if OURS + form in methods):
+            others = [method for method in methods if method != ours and form_of(method) == form_of(ours)]
             out += [
-                results.compare(f"{OURS} - {other}, {stratum}", (condition, OURS), (condition, other), iou)
-                for other in sorted(others, key=lambda name: name != NO_FUSION)
+                results.compare(f"{ours} - {other}, {stratum}", (condition, ours), (condition, other), iou)
+                for other in sorted(others, key=lambda name: name not in ALONE)
                 for iou in (0, 1)
             ]
     return tuple(out)

@@ -27,6 +27,7 @@ from manyeyes.evaluation.detection.benchmark import (
     run_benchmarks,
 )
 from manyeyes.evaluation.detection.communication import Communication
+from manyeyes.evaluation.detection.compute_times import compute_time_s
 from manyeyes.evaluation.detection.frame_match import FrameMatch
 from manyeyes.evaluation.detection.protocols import DetectionProtocol
 from manyeyes.evaluation.statistics.bootstrap import BootstrapSamples, Interval, bootstrap
@@ -64,7 +65,8 @@ class BusVolume:
 @dataclass(frozen=True)
 class MethodMatches:
     """A method in a condition. matches: every evaluated frame, of every class, at each of IOU_THRESHOLDS; speeds: (G,) m/s of the
-    true boxes of each of them. num_frames: evaluated, whatever the number of classes.
+    true boxes of each of them. num_frames: evaluated, whatever the number of classes. answer_matches: the same frames at
+    the time of the answer, which comes answer_ms after the sweep on average.
     """
 
     method: str
@@ -74,6 +76,8 @@ class MethodMatches:
     volume: BusVolume
     age_ms: float
     num_frames: int
+    answer_matches: tuple[tuple[FrameMatch, ...], ...] = ()
+    answer_ms: float = math.nan
 
     @property
     def bytes_per_message(self) -> float:
@@ -128,6 +132,8 @@ def summarize_metrics(metrics: MetricAccumulator) -> MethodMatches:
         volume,
         metrics.mean_age_ms(),
         len(metrics.perceive_s),
+        metrics.match_answers(),
+        metrics.mean_answer_ms(),
     )
 
 
@@ -161,6 +167,15 @@ class ResultGrid:
         """Return the AP of a cell at both IoU thresholds."""
         return self.bootstrap_ap(key, 0), self.bootstrap_ap(key, 1)
 
+    def answer_ap_pair(self, key: ResultKey) -> tuple[Interval, Interval]:
+        """Return the AP of a cell at the time of the answer at both IoU thresholds."""
+        return self._bootstrap_answers(key, 0).interval(), self._bootstrap_answers(key, 1).interval()
+
+    def compare_answers(self, description: str, key: ResultKey, baseline: ResultKey, iou: int = 0) -> Comparison:
+        """Compare AP at the time of the answer of a cell with that of a baseline, paired over scenarios."""
+        difference = self._bootstrap_answers(key, iou).paired_difference(self._bootstrap_answers(baseline, iou))
+        return Comparison(description, f"AP@{IOU_THRESHOLDS[iou]:g} at the answer", difference)
+
     def compute_operating_point(self, key: ResultKey) -> OperatingPoint:
         """Return the metrics of a cell at its score threshold, at the first of IOU_THRESHOLDS."""
         frames = self.results[key].select_matches(0, self.protocol.class_name)
@@ -193,6 +208,14 @@ class ResultGrid:
     def scenarios_of(self, key: ResultKey) -> frozenset[str]:
         """Return the scenarios of a cell."""
         return frozenset(match.scenario for match in self.results[key].matches[0])
+
+    def _bootstrap_answers(self, key: ResultKey, iou: int) -> BootstrapSamples:
+        cache_key = (key, iou, "answer")
+        if cache_key not in self._bootstraps:
+            name = self.protocol.class_name
+            frames = [match for match in self.results[key].answer_matches[iou] if match.class_name == name]
+            self._bootstraps[cache_key] = bootstrap(frames, protocol=self.protocol)
+        return self._bootstraps[cache_key]
 
     def _bootstrap(
         self, key: ResultKey, iou: int, speeds: SpeedRange | None, scenarios: Collection[str] | None
@@ -251,4 +274,5 @@ def make_cell(config: BenchmarkConfig, method: str, recording_hash: str) -> Cell
     corrector_fingerprint = "" if net is None else fingerprint(net).hex()
     corrector = None if correction is None else load_corrector(correction.corrector)
     source = third_party_source(get_strategy(method), detector, getattr(detector, "fusion", None), corrector)
-    return Cell(method, MethodMatches, (method_config, corrector_fingerprint, recording_hash, source), COMPUTED_BY)
+    key = (method_config, corrector_fingerprint, recording_hash, source, compute_time_s(method))
+    return Cell(method, MethodMatches, key, COMPUTED_BY)
