@@ -118,3 +118,10 @@ def test_floats_that_are_not_finite_are_found_at_any_place(dtype):
                 changed[place] = bad
                 data = b"\xff\x7f\xff"[:at] + changed.tobytes()
                 assert primitives.are_finite(data, at, values.itemsize) == np.isfinite(bad)
+
+
+def test_values_on_their_bound_are_within_and_nan_is_not() -> None:
+    values, bounds = np.array([[1.0, -2.0], [-1.0, 0.0]], np.float32), np.array([1.0, 2.0])
+    assert primitives.are_within(values, bounds) and primitives.are_within(values[:0], bounds)
+    for wrong in (np.nan, 2.1, -2.1, np.inf):
+        assert not primitives.are_within(np.concatenate((values, [[0.0, wrong]]), dtype=np.float32), bounds)

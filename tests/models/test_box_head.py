@@ -2,13 +2,15 @@
 """Encoding and decoding of boxes at every head stride; decoding of unusual batches."""
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
 
 from manyeyes.datatypes import LABELS, VEHICLE_LABELS, BevGrid, Boxes, ConfigError, Sites, SparseBev
+from manyeyes.models.detector import box_head
 from manyeyes.models.detector.box_head import (
+    BOX_LAYOUT,
     SPEED_UNIT,
     TYPICAL_SIZE,
     WIDTHS,
@@ -198,3 +200,21 @@ def test_one_class_has_the_tensors_of_earlier_weights() -> None:
 def test_classes_that_cannot_be_are_refused(classes: tuple[str, ...]) -> None:
     with pytest.raises(ConfigError, match="class"):
         BoxHead(8, 16, classes)
+
+
+def test_compiled_decoding_equals_decoding_by_tensors() -> None:
+    """Two grids, boxes that overlap, equal scores, sizes beyond the clamp, and headings that turn round."""
+    rng = torch.Generator().manual_seed(3)
+    grid = BevGrid(-12.8, -12.8, -3.0, 12.8, 12.8, 5.0, 0.4, 4)
+    keys = torch.arange(0, 2 * 256, 2)
+    rows = 2 * torch.randn(len(keys), BOX_LAYOUT.total, generator=rng)
+    rows[:, BOX_LAYOUT.log_size] *= 0.3
+    rows[7, BOX_LAYOUT.log_size] = 9.0
+    rows[20:23] = rows[20]
+    raw = RawBoxes.of(rows, Sites(keys, grid, 2))
+    for config in (DecodeConfig(), DecodeConfig(score_threshold=0.3, max_boxes=20)):
+        for got, want in zip(decode(raw, config), box_head._decode_by_tensors(raw, raw.heatmap_logit, config)):
+            assert 10 < len(want) == len(got)
+            for field in fields(Boxes):
+                a, b = getattr(got, field.name), getattr(want, field.name)
+                assert a.dtype == b.dtype and torch.allclose(a.double(), b.double(), atol=1e-5, rtol=1e-5), field.name

@@ -167,3 +167,15 @@ def test_detector_proposals_fit_their_codes():
     sites = Sites(torch.arange(50), GRID)
     raw = RawBoxes.of(proposals(4, 50), sites)
     assert proposal_to_codes(make_proposals(raw)).shape == (50, PROPOSAL_CODES)
+
+
+@pytest.mark.parametrize("size", [256, 40])
+def test_compiled_decoding_equals_decoding_by_tensors(size: int) -> None:
+    """Any bytes, those of no centre and of no class among them."""
+    rng = torch.Generator().manual_seed(size)
+    codebook = Codebook(12, CodebookConfig(stages=3, size=size))
+    codebook.centres.copy_(torch.randn(codebook.centres.shape, generator=rng))
+    codes = torch.randint(0, 256, (600, codebook.width), generator=rng).to(torch.uint8)
+    got, want = codebook.decode(codes), codebook.decode_by_tensors(codes)
+    assert torch.equal(got[:, 12:], want[:, 12:]) and torch.allclose(got[:, :12], want[:, :12], atol=1e-6)
+    assert codebook.decode(codes[:0]).shape == (0, 12 + PROPOSAL_DIM)

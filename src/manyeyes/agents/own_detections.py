@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import torch
 
+from manyeyes.agents._distance_kernels import has_neighbour
 from manyeyes.datatypes import AgentFrame, Boxes
 
 SAME_OBJECT_DISTANCE_M = 1.0
@@ -24,8 +25,9 @@ BODY_MARGIN_M = 0.35
 
 def restore_own_boxes(fused: Boxes, own: Boxes, min_score: float = MIN_RESTORED_SCORE) -> Boxes:
     """Return the fused boxes, and each own box of min_score without a fused box nearby, at a reduced score; by falling score."""
-    distance = torch.cdist(own.center[:, :2].double(), fused.center[:, :2].double())
-    displaced = (own.score >= min_score) & ~(distance <= SAME_OBJECT_DISTANCE_M).any(1)
+    mine, theirs = (boxes.center.float().contiguous().numpy() for boxes in (own, fused))
+    replaced = torch.from_numpy(has_neighbour(mine, theirs, SAME_OBJECT_DISTANCE_M))
+    displaced = (own.score >= min_score) & ~replaced
     if not displaced.any():
         return fused
     restored = replace(own, score=own.score * DISPLACED_SCORE_FACTOR)[displaced].to(fused.center.dtype)

@@ -18,13 +18,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import Boolx1, I32x2, I64x1, I64x2, Int64, U8x1, U8x2, njit
+from manyeyes._jit import I32x2, I64x1, I64x2, Int64, U8x1, U8x2, njit
 from manyeyes.comms.primitives import PacketError
 from manyeyes.datatypes import ConfigError
 
 TOTAL_BITS = 12
 TOTAL = 1 << TOTAL_BITS
 _MIN_STATE = 1 << 16
+_SHIFT, _BYTE, _ONE, _SLOTS, _INVERSE_BITS = (np.uint64(n) for n in (TOTAL_BITS, 8, 1, TOTAL, 36))
 STATE_BYTES = 3
 MAX_CODED_CELLS = 1 << 18
 """Of a grid whose cells are coded: a forged packet costs its reader milliseconds, not more."""
@@ -91,14 +92,15 @@ class _BodyLimits(NamedTuple):
 
 def pack_coded(key: NDArray[np.int64], rows: NDArray[np.uint8], shape: tuple[int, int], tables: CodeTables) -> bytes:
     """Return ascending keys (n,) on a grid of shape (rows, columns), and their rows (n, W), as one stream."""
-    symbols = np.empty((_room(key, rows), 2), np.int32)
+    symbols = np.empty((_room(key, rows), 3), np.int32)
     count = _symbols(key, rows, shape[0], shape[1], _ByteTables.of(tables), symbols)
-    out = np.empty(2 * count + STATE_BYTES, np.uint8)
+    out = np.empty(2 * len(symbols) + STATE_BYTES, np.uint8)
     used = _write(symbols[:count], out)
     return out[len(out) - used :].tobytes()
 
 
 def _room(key: NDArray[np.int64], rows: NDArray[np.uint8]) -> int:
+    """Return the number of symbols."""
     return (int(key[-1]) + 1 if key.size else 0) + rows.size
 
 
@@ -107,7 +109,8 @@ def unpack_coded(
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
     """Return the inverse of :func:`pack_coded` for count cells: keys (count,) and rows (count, W)."""
     key, rows = np.empty(count, np.int64), np.empty((count, tables.width), np.uint8)
-    raw = np.frombuffer(data, np.uint8)
+    # A copy: numba takes far longer to find the type of an array that is read-only.
+    raw = np.frombuffer(bytearray(data), np.uint8)
     if not _read(raw, shape[0], shape[1], _ByteTables.of(tables), key, rows):
         raise PacketError("garbage", f"{len(data)} bytes are not the stream of {count} cells and their rows.")
     return key, rows
@@ -139,7 +142,7 @@ def _counts(
     counts, bodies, at, top = np.empty(key.shape[0], np.int64), 0, 0, 0
     for k in key:
         top = max(top, k)
-    symbols, ends = np.empty((top + 1 + rows.size, 2), np.int32), _row_ends(rows, tables)
+    symbols, ends = np.empty((top + 1 + rows.size, 3), np.int32), _row_ends(rows, tables)
     order = _Order(key, rows, ends, height, width)
     while at < key.shape[0]:
         room = max(0, (capacity if left < 0 else min(capacity, left - header)) - fixed)
@@ -228,22 +231,32 @@ def _bits(order: _Order, at: int, count: int) -> int:  # pragma: no cover
     if count > min(order.key.shape[0] - at, 65535):
         return 1 << 62
     key = np.sort(order.key[at : at + count])
-    named, counts = np.zeros(key[-1] + 1, np.bool_), _prior(count, order.height * order.width)
-    bits, found, row, column = order.ends[at + count] - order.ends[at], 0, 0, 0
-    for k in range(key[-1] + 1):
-        context = _context(named, k, row, column, order.height, order.width)
-        chance = _cell_frequency(counts, context)
-        if k == key[found]:
-            named[k] = True
-            found += 1
-            bits += _BITS[chance]
-            counts[context, 1] += 2
-        else:
-            bits += _BITS[TOTAL - chance]
-            counts[context, 0] += 2
-        column += 1
-        if column == order.width:
-            row, column = row + 1, 0
+    contexts, counts = _contexts(key, order.height, order.width), _prior(count, order.height * order.width)
+    bits, k = order.ends[at + count] - order.ends[at], 0
+    for named in key:
+        while k < named:
+            context, first = contexts[k], k
+            k += 1
+            while k < named and contexts[k] == context:
+                k += 1
+            bits += _run_bits(counts[context], k - first)
+        context = contexts[k]
+        bits += _BITS[_alike(counts[context])[0]]
+        counts[context, 1] += 2
+        k += 1
+    return bits
+
+
+@njit(cache=True)
+def _run_bits(counts: I64x1, length: int) -> int:  # pragma: no cover
+    """Return the information content of a run of cells of one context that are not named, and count them."""
+    bits = 0
+    while length > 0:
+        chance, alike = _alike(counts)
+        alike = min(alike, length)
+        bits += alike * _BITS[TOTAL - chance]
+        counts[0] += 2 * alike
+        length -= alike
     return bits
 
 
@@ -263,15 +276,31 @@ def _stream_size(
 
 
 @njit(cache=True)
-def _context(named: Boolx1, at: int, row: int, column: int, height: int, width: int) -> int:  # pragma: no cover
-    """Return which neighbours of a cell are named: left, above, above aside, two away."""
-    left = column > 0 and named[at - 1]
-    above = row > 0 and named[at - width]
-    aside = (row > 0 and column > 0 and named[at - width - 1]) or (
-        row > 0 and column + 1 < width and named[at - width + 1]
-    )
-    far = (column > 1 and named[at - 2]) or (row > 1 and named[at - 2 * width])
-    return left + 2 * above + 4 * aside + 8 * far
+def _contexts(key: I64x1, height: int, width: int) -> U8x1:  # pragma: no cover
+    """Return (key[-1] + 1,) contexts of the cells up to the last of ascending keys: see :func:`_mark`."""
+    end = key[-1] + 1
+    contexts = np.zeros(end, np.uint8)
+    for k in key:
+        _mark(contexts, k, k % width, width)
+    return contexts
+
+
+@njit(cache=True)
+def _mark(contexts: U8x1, k: Int64, column: Int64, width: int) -> None:  # pragma: no cover
+    """Write to the contexts of later cells that cell k is named: 1 left, 2 above, 4 above aside, 8 two away."""
+    end = contexts.shape[0]
+    if column + 1 < width and k + 1 < end:
+        contexts[k + 1] |= np.uint8(1)
+    if column + 2 < width and k + 2 < end:
+        contexts[k + 2] |= np.uint8(8)
+    if column > 0 and k + width - 1 < end:
+        contexts[k + width - 1] |= np.uint8(4)
+    if k + width < end:
+        contexts[k + width] |= np.uint8(2)
+    if column + 1 < width and k + width + 1 < end:
+        contexts[k + width + 1] |= np.uint8(4)
+    if k + 2 * width < end:
+        contexts[k + 2 * width] |= np.uint8(8)
 
 
 @njit(cache=True)
@@ -284,42 +313,46 @@ def _prior(count: int, cells: int) -> I64x2:  # pragma: no cover
 
 
 @njit(cache=True)
-def _cell_frequency(counts: I64x2, context: int) -> int:  # pragma: no cover
-    """Frequency, 1 to 4,095, that a cell in this context is named."""
-    chance = TOTAL * counts[context, 1] // (counts[context, 0] + counts[context, 1])
-    return min(max(chance, 1), TOTAL - 1)
+def _alike(counts: I64x1) -> tuple[int, int]:  # pragma: no cover
+    """Return the frequency, 1 to 4,095, that a cell of a context with these counts (2,) is named, and how long it stays.
+
+    It is that of so many cells, if none of them is named: frequencies change slowly.
+    """
+    total = counts[0] + counts[1]
+    chance = TOTAL * counts[1] // total
+    if chance <= 1:
+        return 1, MAX_CODED_CELLS
+    return min(chance, TOTAL - 1), (TOTAL * counts[1] // chance - total) // 2 + 1
 
 
 @njit(cache=True)
 def _symbols(
     key: I64x1, rows: U8x2, height: int, width: int, tables: _ByteTables, out: I32x2
 ) -> int:  # pragma: no cover
-    """Fills out with (start, frequency) of everything to be written; how many there are."""
-    starts, frequencies, _ = tables
+    """Fills out with runs (start, frequency, length) of equal symbols, in the order in which they are read; how many there are."""
     n, at = key.shape[0], 0
     if n == 0:
         return 0
-    named, counts = np.zeros(key[-1] + 1, np.bool_), _prior(n, height * width)
-    found, row, column = 0, 0, 0
-    for k in range(key[-1] + 1):
-        context = _context(named, k, row, column, height, width)
-        chance = _cell_frequency(counts, context)
-        if k == key[found]:
-            named[k] = True
-            found += 1
-            out[at, 0], out[at, 1] = 0, chance
-            counts[context, 1] += 2
-        else:
-            out[at, 0], out[at, 1] = chance, TOTAL - chance
-            counts[context, 0] += 2
-        at += 1
-        column += 1
-        if column == width:
-            row, column = row + 1, 0
+    contexts, counts = _contexts(key, height, width), _prior(n, height * width)
+    k = 0
+    for named in key:
+        while k < named:
+            context, first = contexts[k], k
+            chance, alike = _alike(counts[context])
+            end = min(named, k + alike)
+            while k < end and contexts[k] == context:
+                k += 1
+            out[at, 0], out[at, 1], out[at, 2] = chance, TOTAL - chance, k - first
+            counts[context, 0] += 2 * (k - first)
+            at += 1
+        context = contexts[k]
+        out[at, 0], out[at, 1], out[at, 2] = 0, _alike(counts[context])[0], 1
+        counts[context, 1] += 2
+        at, k = at + 1, k + 1
     for i in range(n):
         for j in range(rows.shape[1]):
             value = rows[i, j]
-            out[at, 0], out[at, 1] = starts[j, value], frequencies[j, value]
+            out[at, 0], out[at, 1], out[at, 2] = tables.starts[j, value], tables.frequencies[j, value], 1
             at += 1
     return at
 
@@ -327,32 +360,45 @@ def _symbols(
 @njit(cache=True)
 def _size(symbols: I32x2) -> int:  # pragma: no cover
     """Return bytes that _write makes."""
-    state, size = np.int64(_MIN_STATE), STATE_BYTES
+    state, size = np.uint64(_MIN_STATE), STATE_BYTES
     for i in range(symbols.shape[0] - 1, -1, -1):
-        start, frequency = np.int64(symbols[i, 0]), np.int64(symbols[i, 1])
-        while state >= frequency << TOTAL_BITS:
-            size += 1
-            state >>= 8
-        state = (state // frequency << TOTAL_BITS) + state % frequency + start
+        start, frequency = np.uint64(symbols[i, 0]), np.uint64(symbols[i, 1])
+        limit, inverse = frequency << _SHIFT, _inverse(frequency)
+        for _ in range(symbols[i, 2]):
+            while state >= limit:
+                size += 1
+                state >>= _BYTE
+            state += ((state * inverse) >> _INVERSE_BITS) * (_SLOTS - frequency) + start
     return size
 
 
 @njit(cache=True)
 def _write(symbols: I32x2, out: U8x1) -> int:  # pragma: no cover
     """Fills the end of out, from back to front; how many bytes."""
-    state, at = np.int64(_MIN_STATE), out.shape[0]
+    state, at = np.uint64(_MIN_STATE), out.shape[0]
     for i in range(symbols.shape[0] - 1, -1, -1):
-        start, frequency = np.int64(symbols[i, 0]), np.int64(symbols[i, 1])
-        while state >= frequency << TOTAL_BITS:
-            at -= 1
-            out[at] = state & 255
-            state >>= 8
-        state = (state // frequency << TOTAL_BITS) + state % frequency + start
+        start, frequency = np.uint64(symbols[i, 0]), np.uint64(symbols[i, 1])
+        limit, inverse = frequency << _SHIFT, _inverse(frequency)
+        for _ in range(symbols[i, 2]):
+            while state >= limit:
+                at -= 1
+                out[at] = state & np.uint64(255)
+                state >>= _BYTE
+            state += ((state * inverse) >> _INVERSE_BITS) * (_SLOTS - frequency) + start
     for _ in range(STATE_BYTES):
         at -= 1
-        out[at] = state & 255
-        state >>= 8
+        out[at] = state & np.uint64(255)
+        state >>= _BYTE
     return out.shape[0] - at
+
+
+@njit(cache=True)
+def _inverse(frequency: np.uint64) -> np.uint64:  # pragma: no cover
+    """Return m such that state * m >> 36 is state // frequency of every state, which has at most 24 bits.
+
+    Granlund and Montgomery, "Division by invariant integers using multiplication", 1994, theorem 4.2.
+    """
+    return np.uint64(((_ONE << _INVERSE_BITS) + frequency - _ONE) // frequency)
 
 
 @njit(cache=True)
@@ -376,27 +422,26 @@ def _read(raw: U8x1, height: int, width: int, tables: _ByteTables, key: I64x1, r
         return False
     n, at = key.shape[0], STATE_BYTES
     cells = height * width
-    named, counts = np.zeros(cells, np.bool_), _prior(n, cells)
-    found, row, column, k = 0, 0, 0, 0
+    contexts, counts = np.zeros(cells, np.uint8), _prior(n, cells)
+    found, k = 0, 0
     while found < n:
         if k == cells or at > raw.shape[0]:
             return False
-        context = _context(named, k, row, column, height, width)
-        chance = _cell_frequency(counts, context)
-        slot = state & TOTAL - 1
-        if slot < chance:
-            state, at = _take(state, chance, slot, raw, at)
-            named[k] = True
+        context, first = contexts[k], k
+        chance, alike = _alike(counts[context])
+        end = min(cells, k + alike)
+        # Cells of one context and frequency that are not named.
+        while k < end and contexts[k] == context and state & TOTAL - 1 >= chance and at <= raw.shape[0]:
+            state, at = _take(state, TOTAL - chance, (state & TOTAL - 1) - chance, raw, at)
+            k += 1
+        counts[context, 0] += 2 * (k - first)
+        if k < end and contexts[k] == context and at <= raw.shape[0]:
+            state, at = _take(state, chance, state & TOTAL - 1, raw, at)
             key[found] = k
             found += 1
             counts[context, 1] += 2
-        else:
-            state, at = _take(state, TOTAL - chance, slot - chance, raw, at)
-            counts[context, 0] += 2
-        k += 1
-        column += 1
-        if column == width:
-            row, column = row + 1, 0
+            _mark(contexts, k, k % width, width)
+            k += 1
     for i in range(n):
         for j in range(rows.shape[1]):
             if at > raw.shape[0]:

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import I64x1, Int64, U8x1, njit
+from manyeyes._jit import F32x1, F32x2, I64x1, Int64, U8x1, njit
 from manyeyes.datatypes import WireError
 
 Reason = Literal["garbage", "version", "checksum", "implausible", "contradiction", "wrong_model"]
@@ -377,3 +377,19 @@ def log_values(codes: NDArray[np.uint8], low: float, high: float) -> NDArray[np.
     """Return the inverse of :func:`log_codes`, within half a step of the logarithm."""
     exponent = (np.maximum(codes, 1).astype(np.float64) - 1) / 254
     return np.where(codes > 0, low * (high / low) ** exponent, 0.0).astype(np.float32)
+
+
+def are_within(values: NDArray[np.float32], bounds: NDArray[np.floating]) -> bool:
+    """Return whether the magnitudes of values (N, C) are at most the bounds (C,); NaN is within no bound."""
+    return bool(_are_within(values, np.asarray(bounds, np.float32)))
+
+
+@njit(cache=True)
+def _are_within(values: F32x2, bounds: F32x1) -> bool:  # pragma: no cover
+    for i in range(values.shape[0]):
+        outside = 0
+        for c in range(values.shape[1]):
+            outside += not abs(values[i, c]) <= bounds[c]
+        if outside:
+            return False
+    return True

@@ -81,9 +81,8 @@ class TokenFormat:
             return "grid"
         if not tokens.features.is_floating_point() or tokens.features.shape[1] != self.channels:
             return "width"
-        # NaN is within no bound.
-        within = tokens.features.abs() <= torch.from_numpy(self.max_values * _ROUNDING)
-        return None if bool(within.all()) else "value"
+        within = primitives.are_within(tokens.features.float().contiguous().numpy(), self.max_values * _ROUNDING)
+        return None if within else "value"
 
     def clamp(self, features: Tensor) -> Tensor:
         """Return features (N, channels) as they may be sent."""

@@ -14,9 +14,12 @@ from torch import Tensor
 from manyeyes._jit import Boolx1, F64x1, F64x2, njit
 from manyeyes.datatypes import ShapeError
 
+MAX_CANDIDATES = 1000
+"""Default number of boxes of highest score that are compared."""
+
 
 @torch.no_grad()
-def rotated_nms(boxes: Tensor, score: Tensor, iou_threshold: float, max_candidates: int = 1000) -> Tensor:
+def rotated_nms(boxes: Tensor, score: Tensor, iou_threshold: float, max_candidates: int = MAX_CANDIDATES) -> Tensor:
     """Return rows (K,) int64 of boxes (N, 5: x, y, length, width, yaw) that survive, in descending score (N,).
 
     The best `max_candidates` boxes are walked from the highest score, equal scores in the order given; each that still stands
@@ -27,12 +30,12 @@ def rotated_nms(boxes: Tensor, score: Tensor, iou_threshold: float, max_candidat
             f"rotated_nms needs boxes (N, 5) and score (N,); got {tuple(boxes.shape)}, {tuple(score.shape)}."
         )
     order = score.argsort(descending=True, stable=True)[:max_candidates]
-    standing = _find_kept(np.ascontiguousarray(boxes[order].double().cpu().numpy()), float(iou_threshold))
+    standing = find_kept(np.ascontiguousarray(boxes[order].double().cpu().numpy()), float(iou_threshold))
     return order[torch.from_numpy(standing).to(order.device)]
 
 
 @njit(cache=True, nogil=True)
-def _find_kept(boxes: F64x2, threshold: float) -> Boolx1:  # pragma: no cover
+def find_kept(boxes: F64x2, threshold: float) -> Boolx1:  # pragma: no cover
     """Return which of boxes (N, 5), best first, no better one that stands overlaps by more than the threshold."""
     n = boxes.shape[0]
     standing = np.ones(n, np.bool_)

@@ -12,6 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from manyeyes.agents._distance_kernels import count_earlier
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.datatypes import AgentFrame, SparseBev
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat, proposed_offset, proposed_velocity
@@ -38,10 +39,8 @@ def distinct_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
 def _decay_scores(tokens: SparseBev, sent_centres: Tensor) -> Tensor:
     """Return scores (N,) of tokens, of which receivers have the objects around sent_centres (M, 2)."""
     place, heat = proposed_centres(tokens), proposed_heat(tokens.features[:, -PROPOSAL_DIM:])
-    rank = heat.argsort(descending=True, stable=True).argsort()
-    more_confident = rank[None, :] < rank[:, None]
-    num_earlier = (more_confident & (torch.cdist(place, place) < SAME_OBJECT_M)).sum(1)
-    num_earlier += (torch.cdist(place, sent_centres) < SAME_OBJECT_M).any(1)
+    arrays = [t.float().contiguous().numpy() for t in (place, heat, sent_centres)]
+    num_earlier = torch.from_numpy(count_earlier(arrays[0], arrays[1], arrays[2], SAME_OBJECT_M))
     return torch.sigmoid(heat) * REDUNDANCY_DECAY**num_earlier
 
 

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import LABELS, VEHICLE_LABELS, VEHICLES, Boxes, ConfigError, Sites, SparseBev
+from manyeyes.models.detector._decode_kernels import DecodeLimits, RawColumns, decode_grid
 from manyeyes.models.detector.layers import SubmanifoldLayer
-from manyeyes.ops.nms import rotated_nms
+from manyeyes.ops.nms import MAX_CANDIDATES, rotated_nms
 
 TYPICAL_SIZE = (4.5, 1.9, 1.6)
 SPEED_UNIT = 10.0
@@ -33,6 +34,12 @@ class RawBoxLayout:
 
 WIDTHS = (1, 2, 1, 3, 2, 2, len(VEHICLE_LABELS), 1, 1, 1, 2)
 BOX_LAYOUT = RawBoxLayout()
+_RAW_COLUMNS = RawColumns(
+    BOX_LAYOUT.offset.start, BOX_LAYOUT.z.start, BOX_LAYOUT.log_size.start, BOX_LAYOUT.axis.start,
+    BOX_LAYOUT.direction.start, BOX_LAYOUT.class_logits.start, BOX_LAYOUT.log_sigma_xy.start,
+    BOX_LAYOUT.log_sigma_yaw.start, BOX_LAYOUT.iou_logit.start, BOX_LAYOUT.velocity.start,
+    len(VEHICLE_LABELS), SPEED_UNIT, *TYPICAL_SIZE,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,6 +247,25 @@ def _relabel(boxes: Boxes, name: str) -> Boxes:
 
 def _decode_class(raw: RawBoxes, heatmap_logit: Tensor, config: DecodeConfig) -> list[Boxes]:
     """Decode the boxes of every grid by a heat map (N,)."""
+    if heatmap_logit.device.type != "cpu" or heatmap_logit.dtype != torch.float32:
+        return _decode_by_tensors(raw, heatmap_logit, config)
+    limits = DecodeLimits(
+        config.score_threshold, config.nms_iou, config.max_boxes, config.iou_score_weight, MAX_CANDIDATES
+    )
+    columns = (raw.to_rows(), raw.sites.xy, heatmap_logit)
+    rows, xy, heat = (column.detach().float().contiguous().numpy() for column in columns)
+    batch, found = raw.sites.batch.numpy(), []
+    for b in range(raw.sites.batch_size):
+        some = slice(None) if raw.sites.batch_size == 1 else batch == b
+        boxes = decode_grid(rows[some], xy[some], heat[some], float(raw.sites.grid.cell_size_m), _RAW_COLUMNS, limits)
+        center, size, yaw, score, label, sigma_xy, sigma_yaw, p_flip, velocity = map(torch.from_numpy, boxes)
+        ids = torch.full_like(label, -1)
+        found.append(Boxes(center, size, yaw, score, label, ids, sigma_xy, sigma_yaw, p_flip, velocity))
+    return found
+
+
+def _decode_by_tensors(raw: RawBoxes, heatmap_logit: Tensor, config: DecodeConfig) -> list[Boxes]:
+    """Do the same on any device."""
     heatmap, iou = torch.sigmoid(heatmap_logit.detach()), torch.sigmoid(raw.iou_logit.detach())
     score = heatmap ** (1 - config.iou_score_weight) * iou**config.iou_score_weight
     batch, found = raw.sites.batch, []

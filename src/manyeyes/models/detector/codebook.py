@@ -17,11 +17,18 @@ from torch import Tensor, nn
 
 from manyeyes._bounds import ChannelCount, StageCount
 from manyeyes.datatypes import ConfigError, ShapeError
+from manyeyes.models.detector._code_kernels import decode_rows
 from manyeyes.models.detector.proposal import PROPOSAL_DIM
-from manyeyes.models.detector.proposal_codes import PROPOSAL_CODES, proposal_from_codes, proposal_to_codes
+from manyeyes.models.detector.proposal_codes import (
+    PROPOSAL_CODES,
+    make_code_rules,
+    proposal_from_codes,
+    proposal_to_codes,
+)
 
 FREQUENCY_TOTAL = 4096
 """Sum of the frequencies of one byte of a row, as required by ``comms.entropy``."""
+_RULES = make_code_rules()
 
 
 @dataclass(frozen=True)
@@ -62,9 +69,17 @@ class Codebook(nn.Module):
 
     def decode(self, codes: Tensor) -> Tensor:
         """Invert encode up to the quantisation error; any bytes (N, W) are valid."""
-        stages, size, _ = self.centres.shape
         if codes.shape[1] != self.width:
             raise ShapeError(f"This codebook reads rows of {self.width} bytes; got {codes.shape[1]}.")
+        if codes.device.type == self.centres.device.type == "cpu" and self.centres.dtype == torch.float32:
+            out = torch.zeros(len(codes), self.centres.shape[2] + PROPOSAL_DIM, device="cpu")
+            decode_rows(codes.to(torch.uint8).contiguous().numpy(), self.centres.numpy(), _RULES, out.numpy())
+            return out
+        return self.decode_by_tensors(codes)
+
+    def decode_by_tensors(self, codes: Tensor) -> Tensor:
+        """Do the same on any device."""
+        stages, size, _ = self.centres.shape
         # With fewer than 256 centres, higher byte values are never encoded, but must not break decoding.
         index = codes[:, :stages].long().clamp_max(size - 1).to(self.centres.device)
         features = self.centres[torch.arange(stages, device=index.device), index].sum(1).to(codes.device)

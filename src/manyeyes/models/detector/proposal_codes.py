@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import VEHICLE_LABELS
+from manyeyes.models.detector._code_kernels import CodeRules
 from manyeyes.models.detector.box_head import BOX_LAYOUT, SPEED_UNIT, axis_yaw
 from manyeyes.models.detector.proposal import PROPOSAL_DIM
 
@@ -43,6 +44,19 @@ def _table() -> tuple[Tensor, Tensor]:
 _COLUMNS, _COLUMN_STEPS = _table()
 PROPOSAL_CODES = len(_COLUMNS) + 4
 """Bytes of an encoded proposal: the single columns, then axis, direction, class, and both sigmas in one."""
+
+
+_AXIS_BYTES = torch.arange(256, device="cpu").float()
+
+
+def make_code_rules() -> CodeRules:
+    """Return the rules of decoding for compiled loops."""
+    turn, layout = _AXIS_BYTES * (2 * math.pi / 256), BOX_LAYOUT
+    return CodeRules(
+        _COLUMNS.numpy(), _COLUMN_STEPS.numpy(), torch.stack((turn.cos(), turn.sin()), 1).numpy(), _along(_AXIS_BYTES).numpy(),
+        layout.axis.start, layout.direction.start, layout.class_logits.start, layout.log_sigma_xy.start,
+        layout.log_sigma_yaw.start, len(VEHICLE_LABELS), _LEADS, _LEAD_STEP, _FACING_STEP, _SIGMA_LOW, _SIGMA_STEP,
+    )  # fmt: skip
 
 
 def proposal_to_codes(proposal: Tensor) -> Tensor:
