@@ -265,6 +265,33 @@ def test_finetune_prints_the_holdout_before_and_after(data, weights, tmp_path, c
     assert checkpoint.read_card(tmp_path / "weights.safetensors")["finetuned_from"] == str(weights)
 
 
+@pytest.mark.slow
+@pytest.mark.training
+def test_finetune_adds_a_class_and_compares_the_classes_of_both(data, weights, tmp_path, capsys) -> None:
+    words = (
+        "--data",
+        data,
+        "--split",
+        "test",
+        "--weights",
+        weights,
+        "--out",
+        tmp_path,
+        "--steps",
+        1,
+        "--max-frames",
+        2,
+    )
+    words += ("--validation", data, "--validation-split", "test", "--classes", "vehicle", "pedestrian")
+    assert run("finetune", *words) == 0
+    capsys.readouterr()
+    assert checkpoint.load(tmp_path / "weights.safetensors").config.classes == ("vehicle", "pedestrian")
+    result = json.loads((tmp_path / "finetune.json").read_text())["result"]
+    found = [(row["weights"], row["class_name"]) for row in result["rows"]]
+    assert {("before", "vehicle"), ("after", "vehicle"), ("after", "pedestrian")} == set(found)
+    assert len(result["comparisons"]) == 2 * found.count(("after", "vehicle"))
+
+
 def test_finetune_refuses_a_recording_that_is_too_short_for_a_holdout(data, weights, tmp_path, capsys) -> None:
     assert run("finetune", "--data", data / "test" / "a", "--weights", weights, "--out", tmp_path) == 1
     assert "too few for a holdout" in capsys.readouterr().err

@@ -58,6 +58,22 @@ def test_an_error_names_the_file_and_the_field(preset, text, error, tmp_path):
     assert str(caught.value).startswith(str(path))
 
 
+def test_classes_replace_those_of_every_detector_of_a_preset(capsys):
+    """Of a stage, and of all stages of a plan and the weights that it releases; a map model has none."""
+    words = ["--classes", "vehicle", "pedestrian", "--print-config"]
+    assert cli.main(["train", "--preset", "costr-tiny", *words]) == 0
+    assert capsys.readouterr().out.count('classes = ["vehicle", "pedestrian"]') == 1
+    plan = TRAINING_PLANS["costr-small"]
+    assert cli.main(["train", "--preset", "costr-small", *words]) == 0
+    expected = len(plan.stages) + (plan.released is not None)
+    assert capsys.readouterr().out.count('classes = ["vehicle", "pedestrian"]') == expected
+    assert cli.main(["train", "--preset", "map-small-lidar", *words]) == 1
+    assert "--classes is for presets of a detector; this one has no classes" in capsys.readouterr().err
+    assert cli.main(["train", "--classes", "vehicle", "vehicle", "--print-config"]) == 1
+    assert "at least one class, each once" in capsys.readouterr().err
+    assert cli.main(["train", "--classes", "tram"]) == 2
+
+
 def test_the_command_prints_what_its_options_make_of_a_file(tmp_path, capsys):
     path = tmp_path / "mine.toml"
     path.write_text("steps = 7\nbatch = 3\n")

@@ -15,10 +15,11 @@ import torch
 
 from manyeyes.datatypes import CheckpointError
 from manyeyes.models import checkpoint
+from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_OPV2V, COSTR_TINY
 from manyeyes.models.fusion.transform_tokens import AgentTokens, to_ego_frame
 from manyeyes.training.detector.samples import AugmentConfig, DegradationConfig
-from manyeyes.training.detector.task import DetectorTask, DetectorTrainConfig, _grow, prune_threshold
+from manyeyes.training.detector.task import DetectorTask, DetectorTrainConfig, _grow, _load_weights, prune_threshold
 from manyeyes.training.trainer import Trainer
 
 pytestmark = pytest.mark.training
@@ -115,6 +116,44 @@ def test_added_modules_start_without_effect(toy, tmp_path):
     assert len(ego_past.features) > 20 and torch.equal(boxes[0].sites.key, boxes[1].sites.key)
     assert torch.allclose(fused[0].bev.features, fused[1].bev.features, atol=1e-5)
     assert torch.allclose(boxes[0].to_rows(), boxes[1].to_rows(), atol=1e-6)
+
+
+def fuse_alone(detector, cloud):
+    """What a detector finds in a cloud, before decoding: its own boxes, and those after fusion with nothing."""
+    with torch.no_grad():
+        tokens = detector.extract_features([cloud]).tokens
+        own = detector.predict(tokens)
+        shared = detector.make_tokens(tokens, own)
+        return own, detector.fuse(
+            to_ego_frame([AgentTokens(0, shared.features, shared.sites.xy)], detector.token_grid, 1)
+        )[1]
+
+
+def test_an_added_class_leaves_the_heat_of_the_others(toy, tmp_path):
+    with torch.random.fork_rng():
+        torch.manual_seed(3)
+        plain = dataclasses.replace(COSTR_TINY, prune_threshold=0.0)
+        old = Detector(plain).eval()
+        torch.nn.init.normal_(old.refine.out.weight, std=0.05)
+        checkpoint.save(old, tmp_path / "one.safetensors", {})
+        two = Detector(dataclasses.replace(plain, classes=("pedestrian", "vehicle"))).eval()
+        _load_weights(two, tmp_path / "one.safetensors")
+        cloud = toy().snapshot("toy_0", 1).frames[0].points
+        begun = fuse_alone(two, cloud)
+        torch.nn.init.normal_(two.refine.out.bias[-2:], std=0.5)
+        torch.nn.init.normal_(two.head.out.weight[-2:-1], std=0.5)
+        checkpoint.save(two, tmp_path / "two.safetensors", {})
+        three = Detector(dataclasses.replace(plain, classes=("vehicle", "cyclist", "pedestrian"))).eval()
+        _load_weights(three, tmp_path / "two.safetensors")
+    for one_raw, begun_raw in zip(fuse_alone(old, cloud), begun):
+        assert one_raw.heatmap_logit.numel() > 20
+        assert torch.allclose(one_raw.heatmap_logit, begun_raw.class_heat[:, 1], atol=1e-5)
+    for two_raw, three_raw in zip(*(fuse_alone(detector, cloud) for detector in (two, three))):
+        assert torch.allclose(two_raw.class_heat[:, 0], three_raw.class_heat[:, 2], atol=1e-5)
+        assert torch.allclose(two_raw.class_heat[:, 1], three_raw.class_heat[:, 0], atol=1e-5)
+    # A class that is new has low heat at first.
+    assert three.head.out.bias[-2].item() == -6.0 and three.refine.out.bias[-2].item() == -4.0
+    assert not three.head.out.weight[-2].any() and not three.refine.out.weight[-2].any()
 
 
 MEASURE = """

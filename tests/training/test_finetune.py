@@ -37,6 +37,16 @@ def test_the_plan_keeps_the_released_configuration():
     assert config.augment.sensors is None and config.detector.codebook is None
 
 
+def test_classes_are_added_to_those_of_the_weights():
+    plan = make_finetune_plan(COSTR_SMALL, 10, classes=("vehicle", "pedestrian"))
+    ((_, config),) = plan.stages
+    assert plan.released.classes == config.detector.classes == ("vehicle", "pedestrian")
+    with pytest.raises(ConfigError, match="detect vehicle, too; name it"):
+        make_finetune_plan(COSTR_SMALL, 10, classes=("cyclist",))
+    with pytest.raises(ConfigError, match="each once"):
+        make_finetune_plan(COSTR_SMALL, 10, classes=("vehicle", "vehicle"))
+
+
 @pytest.fixture
 def start(tmp_path):
     with torch.random.fork_rng():

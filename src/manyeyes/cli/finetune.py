@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from manyeyes._bounds import Fraction, LearningRate, OutputFolder, PositiveInt, Seed, WorkerCount
 from manyeyes.cli.compute_options import ComputeOptions
+from manyeyes.studies.options import ClassName
 from manyeyes.studies.replay_options import FileChecks
 
 if TYPE_CHECKING:
@@ -46,6 +47,8 @@ class Options:
     """Steps of the optimiser; by default by the number of frames, 120 for 20 and 600 for 500."""
     learning_rate: LearningRate = 5e-4
     """Its peak. Halve it where AP falls on the holdout."""
+    classes: tuple[ClassName, ...] = ()
+    """Classes of objects that the result finds; by default those of the weights. New ones begin untrained and need more steps."""
     codebook: Literal["refit", "keep"] = "refit"
     """Whether the codebook is fitted to the new tokens, or that of the weights is kept."""
     max_frames: PositiveInt = 200
@@ -91,7 +94,10 @@ def _finetune(options: Options, execution: Execution, console: Console) -> None:
     steps = options.steps or choose_steps(num_frames)
     console.print(f"{num_frames} frames for training, {num_held} held out; {steps} steps", highlight=False)
     with pretrained.open_detector_file(options.weights) as start, make_progress_bars(console) as bars:
-        plan = make_finetune_plan(checkpoint.load(start).config, steps, options.learning_rate, options.codebook)
+        begun = checkpoint.load(start).config
+        plan = make_finetune_plan(
+            begun, steps, options.learning_rate, options.codebook, options.classes or begun.classes
+        )
         plan = plan.change_stages(
             micro_batch=options.compute.micro_batch, precision=options.compute.precision or "float32"
         )
@@ -177,7 +183,9 @@ def _write_results(
             f"AP@{iou}",
             new.paired_difference(old, row, after.protocol),
         )
-        for old, new in zip(before.methods, after.methods, strict=True)
+        for new in after.methods
+        for old in before.methods
+        if (old.method, old.class_name) == (new.method, new.class_name)
         for row, iou in enumerate((0.5, 0.7))
     )
     table = StudyTable("Holdout", ("weights", "method", "AP@0.5", "AP@0.7", "bytes/message"), lines)

@@ -25,6 +25,7 @@ from manyeyes._bounds import (
     WorkerCount,
 )
 from manyeyes.cli.compute_options import ComputeOptions
+from manyeyes.studies.options import ClassName
 from manyeyes.studies.replay_options import FileChecks
 
 if TYPE_CHECKING:
@@ -85,6 +86,8 @@ class Options:
     """Instead of the preset's; of a plan that of each stage."""
     fusion: str | None = None
     """Fusion module of a detector by name, one of your own too, instead of the preset's; an unknown name lists the known ones."""
+    classes: tuple[ClassName, ...] = ()
+    """Classes of objects that a detector finds, instead of the preset's, mostly vehicles. Weights to begin from may have fewer."""
     weights: tuple[Path, ...] = ()
     """Weights to begin from instead of random ones, such as those of the stage before; of a plan, its first stage. Of a map model
     several, each what it has in common with the preset, the first before the others. For feakm and feakm-paper the detector whose
@@ -146,31 +149,35 @@ def choose_preset(options: Options) -> TrainConfig | TrainPlan:
     given = {name: getattr(options, name) for name in _REPLACED}
     given |= {name: getattr(options.compute, name) for name in ("micro_batch", "precision")}
     given = {name: value for name, value in given.items() if value is not None}
+    replaced: dict[str, Any] = {} if options.fusion is None else {"fusion": options.fusion}
+    replaced |= {"classes": options.classes} if options.classes else {}
     if not isinstance(chosen, TrainPlan):
-        return _change_config(chosen, options.fusion, given)
+        return _change_config(chosen, replaced, given)
     plan = chosen
-    stages = ((name, _change_config(config, options.fusion, given)) for name, config in plan.stages)
-    released = (
-        plan.released
-        if plan.released is None or options.fusion is None
-        else replace(plan.released, fusion=options.fusion)
-    )
+    stages = ((name, _change_config(config, replaced, given)) for name, config in plan.stages)
+    released = None if plan.released is None else replace(plan.released, **replaced)
     return replace(plan, stages=tuple(stages), released=released)
 
 
-def _change_config(config: _Config, fusion: str | None, given: dict[str, Any]) -> _Config:
-    return replace(config if fusion is None else _with_fusion(config, fusion), **given)
+def _change_config(config: _Config, detector: dict[str, Any], given: dict[str, Any]) -> _Config:
+    """Return the settings with fields replaced, and with fields of the detector replaced."""
+    return replace(_change_detector(config, detector) if detector else config, **given)
 
 
-def _with_fusion(config: _Config, fusion: str) -> _Config:
+def _change_detector(config: _Config, replaced: dict[str, Any]) -> _Config:
     from manyeyes.datatypes import ConfigError
+    from manyeyes.models.detector.box_head import check_classes
     from manyeyes.models.fusion.registry import get_fusion
     from manyeyes.training.detector.task import DetectorTrainConfig
 
     if not isinstance(config, DetectorTrainConfig):
-        raise ConfigError("--fusion is for presets of a detector; this one has no fusion module by name.")
-    get_fusion(fusion)
-    return replace(config, detector=replace(config.detector, fusion=fusion))
+        names = {"fusion": "no fusion module by name", "classes": "no classes"}
+        name = next(iter(replaced))
+        raise ConfigError(f"--{name} is for presets of a detector; this one has {names[name]}.")
+    detector = replace(config.detector, **replaced)
+    get_fusion(detector.fusion)
+    check_classes(detector.classes)
+    return replace(config, detector=detector)
 
 
 def _train(

@@ -12,6 +12,9 @@ from manyeyes._bounds import AngleDeg, ByteCount, OutputFolder, PositiveInt, See
 from manyeyes.studies.pose_error_options import PoseErrorOptions
 from manyeyes.studies.replay_options import BOTH_FORMS, FileChecks, ReplayOptions
 
+ClassName = Literal["vehicle", "pedestrian", "cyclist"]
+"""A name of ``datatypes.CLASSES``, written out so that --help imports nothing heavy."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class StudyOptions:
@@ -44,7 +47,7 @@ class EvaluationOptions(RecordingStudyOptions):
     protocol: str = "global-sort"
     """Evaluation protocol: global-sort, opencood, coalign, sparsealign; on OPV2V also coalign-opv2v, heal-opv2v; on DAIR-V2X
     dair, dair-3d, heal-dair, costr-dair, costr-dair-centred, sparsealign-dair."""
-    object_class: Literal["vehicle", "pedestrian", "cyclist"] | None = None
+    object_class: ClassName | None = None
     """The class whose numbers are computed; by default all that the weights detect in 'evaluate', the first of them in a study."""
     workers: WorkerCount = os.cpu_count() or 1
     """How many processes share the scenarios; results do not depend on it."""

@@ -7,6 +7,8 @@ import math
 from dataclasses import replace
 from typing import Literal
 
+from manyeyes.datatypes import ConfigError
+from manyeyes.models.detector.box_head import check_classes
 from manyeyes.models.detector.codebook import CodebookConfig
 from manyeyes.models.detector.detector import DetectorConfig
 from manyeyes.training.detector.losses import LossConfig
@@ -33,7 +35,11 @@ def choose_steps(num_frames: int) -> int:
 
 
 def make_finetune_plan(
-    detector: DetectorConfig, steps: int, learning_rate: float = LEARNING_RATE, codebook: CodebookChoice = "refit"
+    detector: DetectorConfig,
+    steps: int,
+    learning_rate: float = LEARNING_RATE,
+    codebook: CodebookChoice = "refit",
+    classes: tuple[str, ...] | None = None,
 ) -> TrainPlan:
     """Make the plan of one stage that trains weights of a configuration on.
 
@@ -44,7 +50,18 @@ def make_finetune_plan(
         steps: of the optimiser.
         learning_rate: its peak.
         codebook: refit: to the new tokens; keep: that of the weights. Weights without one get one.
+        classes: of objects that the result detects; by default those of the weights.
+
+    Raises:
+        ConfigError: a class is unknown, or the result would lack one of the weights.
     """
+    wanted = check_classes(classes or detector.classes)
+    lacking = [name for name in detector.classes if name not in wanted]
+    if lacking:
+        raise ConfigError(
+            f"The weights detect {', '.join(lacking)}, too; name {'it' if len(lacking) == 1 else 'them'} among the classes."
+        )
+    detector = replace(detector, classes=wanted)
     config = DetectorTrainConfig(
         replace(detector, codebook=None),
         steps=steps,

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ from manyeyes.datasets.base import Recording
 from manyeyes.datasets.recording_check import check_recording
 from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.models import checkpoint
+from manyeyes.models.detector.box_head import BOX_LAYOUT
 from manyeyes.models.detector.detector import Detector, DetectorConfig
 from manyeyes.models.sensor_domain import write_sensor_domain
 from manyeyes.models.token_peaks import CARD_KEY, NUM_SAMPLES, measure_token_peaks
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
 
 NUM_SENSOR_SCENARIOS = 60
 """Maximum number of scenarios whose sensors are measured at the end of training."""
+_NEW_CLASS_HEAT, _NEW_CLASS_RESIDUAL = -6.0, -4.0
+"""Logit of the heat of a class that initial weights do not have, and what fusion adds to it."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +162,7 @@ def _load_weights(model: Detector, start: Path) -> None:
 
     New modules keep their initialisation, and new rows and columns of a matrix start at zero, so that both have no
     effect at first. Modules
-    that the model lacks are skipped, as in an ablation.
+    that the model lacks are skipped, as in an ablation. The heat of a class is that of the class in the file.
     """
     state, own = checkpoint.read_state(start), model.state_dict()
     begun = {name: _grow(value, state[name]) for name, value in own.items() if name in state}
@@ -168,7 +172,30 @@ def _load_weights(model: Detector, start: Path) -> None:
             f"{start}: cannot start this preset, tensor {(odd or sorted(state))[0]} does not fit; "
             "start from weights of the same architecture."
         )
+    if len(model.config.classes) > 1:
+        _map_class_heat(begun, state, checkpoint.load(start).config.classes, model.config.classes)
     model.load_state_dict(begun, strict=False)
+
+
+def _map_class_heat(
+    begun: Mapping[str, Tensor | None], state: Mapping[str, Tensor], old_classes: Sequence[str], classes: Sequence[str]
+) -> None:
+    """Set the rows of heads that predict the heat of each class: those of the class in the file, low heat for a new class.
+
+    A head for one class has no such row; its heat is row 0, which the head of fusion adds to the heat of every class. Low heat at
+    first keeps a new class out of the proposals, which have the maximum over classes.
+    """
+    for head, new_bias in (("head", _NEW_CLASS_HEAT), ("refine", _NEW_CLASS_RESIDUAL)):
+        for part, new_value in (("weight", 0.0), ("bias", new_bias)):
+            rows, old = begun[f"{head}.out.{part}"], state[f"{head}.out.{part}"]
+            assert rows is not None
+            for row, kind in enumerate(classes, BOX_LAYOUT.total):
+                if kind not in old_classes:
+                    rows[row] = new_value
+                elif len(old_classes) > 1:
+                    rows[row] = old[BOX_LAYOUT.total + old_classes.index(kind)]
+                else:
+                    rows[row] = old[0] if head == "head" else 0.0
 
 
 def _grow(new: Tensor, old: Tensor) -> Tensor | None:
