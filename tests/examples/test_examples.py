@@ -142,3 +142,11 @@ def test_10_own_data(tmp_path: Path) -> None:
     assert opened.split()[0] == "NpzRecording" and heading.split()[0] == "method"
     assert [row.split()[0] for row in rows] == ["no-fusion", "late", "early"]
     assert all(float(row.split()[1]) > 0.5 for row in rows)
+
+
+@pytest.mark.slow
+def test_11_live_agents(tmp_path: Path) -> None:
+    pytest.importorskip("cryptography", reason="the 'live' extra is not installed")
+    rows = sorted(run("11_live_agents.py", str(tmp_path / "keys")).strip().splitlines())
+    assert [row.partition(":")[0] for row in rows] == ["agent 1", "agent 2"]
+    assert all(row.endswith("[(10, 0), (20, 4)]") for row in rows)

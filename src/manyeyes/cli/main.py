@@ -28,6 +28,7 @@ COMMANDS = {
     "view": "draw a frame of a recording, or animate a drive",
     "pose": "evaluate pose correction from detected objects: prior and corrected poses",
     "map": "one map from many drives: build, simulate, fuse, evaluate, diff, export, view, import, retract",
+    "live": "agents as processes on a network: run one, demo of a team, replay of a recorded run",
     "keys": "keys and certificates of agents on a network: make, issue, verify, revoke",
     "study": "reproduce a table or figure: robustness, bandwidth, pose noise, map fusion, ...",
     "doctor": "print what a bug report needs",
@@ -43,6 +44,11 @@ COMMAND_GROUPS = {
         "diff": "list what changed from one map to another",
         "export": "export a map: GeoJSON, GeoPackage, Lanelet2, Argoverse 2, nuScenes, PMTiles",
         "view": "draw a map as a web page (.html) that needs no internet, or as an image (.png)",
+    },
+    "live": {
+        "run": "run one agent on a network, on the frames of a recording in real time",
+        "demo": "run a whole team on this machine, a process for each agent",
+        "replay": "compute a recorded run again, and compare bit for bit",
     },
     "keys": {
         "anchor": "make an anchor, the key that all certificates are traced to, and a trust file",

@@ -75,6 +75,8 @@ _EXECUTORS = (
     Requirement("ray", EXTRAS["ray"]).when("executor", "ray"),
 )
 _TENSORBOARD = Requirement("train", EXTRAS["train"]).when("compute.tensorboard", "True")
+_ZENOH = Requirement("live", ("zenoh",)).when("network.transport", "zenoh")
+_MCAP = Requirement("live", ("mcap",))
 _CRYPTOGRAPHY = Requirement("live", ("cryptography",))
 _GICP = Requirement("icp", EXTRAS["icp"]).when("correctors", "gicp")
 
@@ -112,6 +114,9 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
         _GEOPACKAGE.when("file", "*.gpkg", "*.pmtiles"),
     ),
     "map view": (_ARROW, _SHAPELY, _MATPLOTLIB.when("out", "*.png")),
+    "live run": (_ZENOH, _CRYPTOGRAPHY.when("security.security", "warn", "require"), _MCAP.when("record", "*")),
+    "live demo": (Requirement("live", EXTRAS["live"]),),
+    "live replay": (_MCAP, _CRYPTOGRAPHY),
     "keys anchor": (_CRYPTOGRAPHY,),
     "keys issue": (_CRYPTOGRAPHY,),
     "keys pool": (_CRYPTOGRAPHY,),

@@ -127,6 +127,15 @@ class Inbox:
             for held in self._senders.current_messages()
         )
 
+    def complete_senders(self, since_ns: int) -> frozenset[int]:
+        """Return the senders whose newest message was captured at since_ns or later, and is complete. Nothing changes."""
+        held = (message.assembly for message in self._senders.current_messages())
+        return frozenset(
+            assembly.header.agent_id
+            for assembly in held
+            if assembly.header.timestamp_ns >= since_ns and len(assembly.fragments) == assembly.header.num_packets
+        )
+
     def take_rejections(self) -> tuple[Rejection, ...]:
         """Senders whose tokens were refused since the last call, the last reason of each, by agent id."""
         taken, self._rejections = self._rejections, {}

@@ -28,6 +28,10 @@ class ReceivedPacket(NamedTuple):
 class Network(Protocol):
     """The network of one agent. Packets get lost, are duplicated and arrive in any order; none are queued without a bound."""
 
+    def join(self, position_xy: tuple[float, float]) -> None:
+        """Receive from the agents around a position (world, metres) from now on; sending does this too."""
+        ...
+
     def send(self, packets: Sequence[bytes], position_xy: tuple[float, float]) -> None:
         """Send packets to the agents around a position (world, metres); what cannot be sent at once is dropped."""
         ...

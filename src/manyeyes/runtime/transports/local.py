@@ -19,6 +19,10 @@ class LocalNetwork:
         self._position_xy = (0.0, 0.0)
         self._last_ns: dict[str, int] = {}
 
+    def join(self, position_xy: tuple[float, float]) -> None:
+        """Receive at a position; sending does this too."""
+        self._position_xy = position_xy
+
     def send(self, packets: Sequence[bytes], position_xy: tuple[float, float]) -> None:
         """Hand packets to the channel; its loss depends on the distance of sender and receiver."""
         self._position_xy = position_xy

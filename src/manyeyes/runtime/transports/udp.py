@@ -101,7 +101,7 @@ class UdpNetwork:
         """Return the addresses that something came from within a second."""
         return self._rings.links()
 
-    def move(self, position_xy: tuple[float, float]) -> None:
+    def join(self, position_xy: tuple[float, float]) -> None:
         """Receive from the tiles around a position; sending does this too."""
         self._move(position_xy)
 

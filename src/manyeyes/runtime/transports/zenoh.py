@@ -85,6 +85,10 @@ class ZenohNetwork:
         """Number of packets that gave way to newer ones of their link before they were polled."""
         return self._rings.overflows
 
+    def join(self, position_xy: tuple[float, float]) -> None:
+        """Receive from the tiles around a position; sending does this too."""
+        self._move(position_xy)
+
     def send(self, packets: Sequence[bytes], position_xy: tuple[float, float]) -> None:
         """Publish packets under the key of the agent's tile."""
         self._move(position_xy)

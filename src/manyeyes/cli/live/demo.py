@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Run a whole team on this machine: a process for each agent of a drive, signed packets, one network, one table.
+
+Without a recording, the drive of 'manyeyes demo' is simulated. Where the processes do not fit on the cores, the clock is slowed
+down, and the rate is printed. Each run is recorded, and computed again from its recording.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from manyeyes._bounds import InputPath, OutputFolder, PlaybackRate, PositiveInt, Seed, WorkerCount
+from manyeyes.cli.live.options import MethodOptions
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+START_TIMEOUT_S, END_TIMEOUT_S = 600.0, 60.0
+FRAME_S, BUSY_FRACTION = 0.1, 0.6
+"""Duration of a frame, and the fraction of the cores that the processes may need for the clock to be that of the wall."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """How many agents of which drive."""
+
+    agents: WorkerCount = 4
+    """Number of agents, the first ones of the drive."""
+    recording: InputPath | None = None
+    """A recording; by default the drive of 'manyeyes demo' is simulated."""
+    split: str | None = None
+    """Which split of a data set, such as test."""
+    scenario: str | None = None
+    """Which scenario; the first by default."""
+    frames: PositiveInt = 40
+    """At most so many frames."""
+    rate: PlaybackRate | None = None
+    """Speed of the clock; by default 1, or what the cores allow."""
+    transport: Literal["zenoh", "udp"] = "zenoh"
+    """The network between the processes."""
+    security: Literal["off", "warn", "require"] = "require"
+    """Signatures; keys are made for the run."""
+    out: OutputFolder = Path("out/live")
+    """Folder for keys, recordings and summaries."""
+    check: bool = True
+    """Compute each recorded run again, and compare bit for bit."""
+    seed: Seed = 0
+    """Of the simulated drive."""
+    method: MethodOptions = field(default_factory=MethodOptions)
+    """What is sent and fused."""
+
+
+def main(options: Options) -> None:
+    """Run the team."""
+    from rich.console import Console
+
+    from manyeyes._lock import hold_folder
+
+    with hold_folder(options.out):
+        _run_team(options, Console())
+
+
+def _run_team(options: Options, console: Console) -> None:
+    from manyeyes.cli.live.replay import check_run
+    from manyeyes.cli.live.table import load_summary, print_summaries
+    from manyeyes.datasets.registry import open_recording
+    from manyeyes.datatypes import ConfigError
+    from manyeyes.studies.replay_options import make_excerpt
+
+    root, split = _find_drive(options, console)
+    recording = open_recording(root, split)
+    scenario = make_excerpt(recording, options.scenario).scenario
+    present = recording.agents(scenario)
+    if len(present) < options.agents:
+        raise ConfigError(f"--agents {options.agents}: scenario {scenario} has {len(present)}; choose at most so many.")
+    agents = present[: options.agents]
+    for old in options.out.glob("agent-*.*"):
+        old.unlink()
+    commands = [
+        _make_command(
+            options, [str(root), *(["--split", split] if split else []), "--scenario", scenario], agent, number
+        )
+        for number, agent in enumerate(agents)
+    ]
+    _make_keys(options, agents)
+    rate = _run_processes(commands, options, console)
+    files = [options.out / f"agent-{agent}.json" for agent in agents]
+    print_summaries([load_summary(file) for file in files], console)
+    pace = "in real time" if rate == 1 else f"at {rate:.3g} of real time: that many agents do not fit on these cores"
+    console.print(f"{len(agents)} processes, {options.transport}, security {options.security}, {pace}", soft_wrap=True)
+    for agent in agents if options.check else ():
+        console.print(check_run(options.out / f"agent-{agent}.mcap"), highlight=False, markup=False, soft_wrap=True)
+
+
+def _find_drive(options: Options, console: Console) -> tuple[Path, str | None]:
+    """Return a recording and its split; simulate one where none is given."""
+    if options.recording is not None:
+        return options.recording, options.split
+    from manyeyes.simulator.presets import simulate
+
+    folder = options.out / "recording" / f"seed-{options.seed}"
+    with console.status("Simulating a drive"):
+        simulate("demo", folder, options.seed, 1)
+    return folder, "test"
+
+
+def _make_keys(options: Options, agents: Sequence[int]) -> None:
+    """Make a federation of the agents, in place of that of an earlier run."""
+    if options.security == "off":
+        return
+    from manyeyes.runtime.federation import make_demo_federation
+
+    folder = options.out / "keys"
+    for old in folder.glob("*"):
+        old.unlink()
+    make_demo_federation(folder, agents, 1_440)
+
+
+def _make_command(options: Options, drive: Sequence[str], agent: int, number: int) -> list[str]:
+    """Return the command of one process; the first one listens, the others connect to it, or all share a port."""
+    keys, method = options.out / "keys", options.method
+    words = [sys.executable, "-m", "manyeyes.cli.main", "live", "run", *drive, "--agent", str(agent), "--await-start"]
+    words += ["--frames", str(options.frames), "--net", f"demo-{os.getpid()}", "--transport", options.transport]
+    words += ["--record", str(options.out / f"agent-{agent}.mcap"), "--out", str(options.out / f"agent-{agent}.json")]
+    words += ["--weights", method.weights, "--method", method.method, "--budget-bytes", str(method.budget_bytes)]
+    words += ["--pose-correction", method.pose_correction] if method.pose_correction else []
+    if options.security != "off":
+        words += ["--security", options.security, "--trust", str(keys / "trust.toml")]
+        words += ["--key", str(keys / f"agent-{agent}.key")]
+    if options.transport == "udp":
+        return [*words, "--port", str(_FREE_PORT.number)]
+    seed = f"tcp/127.0.0.1:{_FREE_PORT.number}"
+    return [*words, *(["--connect", seed] if number else ["--listen", seed])]
+
+
+class _FreePort:
+    """A port of this machine that is free now; the same for all processes of the team."""
+
+    def __init__(self) -> None:
+        self._number = 0
+
+    @property
+    def number(self) -> int:
+        """The port."""
+        if not self._number:
+            with socket.socket() as probe:
+                probe.bind(("127.0.0.1", 0))
+                self._number = int(probe.getsockname()[1])
+        return self._number
+
+
+_FREE_PORT = _FreePort()
+
+
+def _run_processes(commands: Sequence[Sequence[str]], options: Options, console: Console) -> float:
+    """Start the processes together, and wait for their end; return the rate of their clock."""
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    processes = [subprocess.Popen(command, env=environment, **pipes) for command in commands]
+    try:
+        with console.status("Starting the agents"):
+            seconds = [_read_ready(process) for process in processes]
+        rate = options.rate or min(1.0, BUSY_FRACTION * (os.cpu_count() or 1) * FRAME_S / sum(seconds))
+        start_ns = time.time_ns() + 1_000_000_000
+        for process in processes:
+            assert process.stdin is not None
+            process.stdin.write(f"{start_ns} {rate!r}\n")
+            process.stdin.flush()
+        with console.status(f"{len(processes)} agents on the network"):
+            for process in processes:
+                process.communicate(timeout=1.0 + options.frames * FRAME_S / rate * 3 + END_TIMEOUT_S)
+        return rate
+    finally:
+        _end(processes)
+
+
+def _read_ready(process: subprocess.Popen[str]) -> float:
+    """Return the seconds of a frame that a process reports when it is ready."""
+    from manyeyes.cli.live.run import READY
+    from manyeyes.datatypes import ManyeyesError
+
+    assert process.stdout is not None
+    readable, _, _ = select.select([process.stdout], [], [], START_TIMEOUT_S)
+    word, _, seconds = (process.stdout.readline() if readable else "").partition(" ")
+    if word != READY:
+        raise ManyeyesError("An agent ended, or did not start in time; its error is above.")
+    return max(float(seconds), 1e-3)
+
+
+def _end(processes: Sequence[subprocess.Popen[str]]) -> None:
+    """End the processes that run, and report those that failed."""
+    from manyeyes.datatypes import ManyeyesError
+
+    is_cut = [process.poll() is None for process in processes]
+    for process, running in zip(processes, is_cut):
+        if running:
+            process.terminate()
+    for process, running in zip(processes, is_cut):
+        if running:
+            try:
+                process.wait(END_TIMEOUT_S / 10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+    if sys.exc_info()[0] is None and any(process.returncode for process in processes):
+        raise ManyeyesError("An agent failed; its error is above.")
