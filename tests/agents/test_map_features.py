@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Map features as packets: tiles are predicted from received features only."""
 
+import copy
 import dataclasses
 import math
 
@@ -35,6 +36,17 @@ def test_full_precision_through_bytes_is_the_model_itself(mapper):
     np.testing.assert_allclose(there.score, here.score, atol=1e-4)
     np.testing.assert_array_equal(there.kind, here.kind)
     np.testing.assert_allclose(there.points, here.points, atol=1e-2)
+
+
+def test_packets_and_tiles_are_those_of_the_cpu_wherever_the_weights_are(mapper, device):
+    frames, theirs = [frame(1), frame(2, x=5.0, yaw=math.pi)], copy.deepcopy(mapper).to(device)
+    features = theirs.extract_features([frames[0].points])
+    assert features.tokens.features.device == theirs.device == device
+    one, other = (drawn(model, frames, token_encoding="float32") for model in (mapper, theirs))
+    assert len(one) > 0
+    np.testing.assert_array_equal(other.kind, one.kind)
+    np.testing.assert_allclose(other.score, one.score, atol=1e-4)
+    np.testing.assert_allclose(other.points, one.points, atol=1e-2)
 
 
 def test_the_order_of_messages_does_not_count(mapper):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """FeaKM's truth and loss by hand, its cache, its loop, and a batch learnt by heart."""
 
+import copy
 import json
 import math
 from dataclasses import replace
@@ -13,9 +14,9 @@ from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
 from manyeyes.models.pose.box_descriptors import BoxKeypointConfig
-from manyeyes.models.pose.feakm import FEAKM_PAPER, FeakmConfig, load
+from manyeyes.models.pose.feakm import FEAKM_PAPER, FeakmConfig, FeakmNet, load
 from manyeyes.models.pose.keypoint_net import DenseKeypointConfig, DetectorView
-from manyeyes.models.pose.matcher import Assignment, MatcherConfig
+from manyeyes.models.pose.matcher import Assignment, KeypointBatch, MatcherConfig
 from manyeyes.models.pose.neighbour_geometry import NeighbourGeometryConfig
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.pose.feakm import FeakmCorrector
@@ -221,3 +222,42 @@ def test_the_published_net_takes_a_step_and_resumes(cache, tmp_path):
 def test_settings_that_contradict_each_other_are_refused():
     with pytest.raises(ConfigError, match="match_radius_m <= unmatched_radius_m"):
         replace(TINY, match_radius_m=3.0)
+
+
+DENSE = DenseKeypointConfig(CHANNELS, (8, 8, 16), 16, min_score=0.0, num_keypoints=16)
+
+
+@pytest.mark.parametrize("keypoints", [TINY.net.keypoints, DENSE], ids=["boxes", "dense"])
+def test_a_run_goes_on_on_another_device_and_back(cache, tmp_path, device, keypoints):
+    config = replace(TINY, net=replace(TINY.net, keypoints=keypoints), augment=KeypointAugmentConfig())
+    whole = Trainer(FeakmTask(config, cache, 3), tmp_path / "whole")
+    progress = [whole.advance() for _ in range(3)]
+    moved = []
+    for kind in ("cpu", device, "cpu"):
+        run = Trainer(FeakmTask(config, cache, 3), tmp_path / "moved", kind)
+        assert run.step == len(moved) and all(p.device == run.device for p in run.model.parameters())
+        moved.append(run.advance())
+        run.save()
+    assert [p.loss for p in moved] == pytest.approx([p.loss for p in progress], rel=1e-3)
+    assert moved[1].terms == progress[1].terms
+
+
+@pytest.mark.parametrize("keypoints", [TINY.net.keypoints, DENSE], ids=["boxes", "dense"])
+def test_views_enter_and_keypoints_and_matches_leave_on_the_cpu(cache, device, keypoints):
+    torch.manual_seed(0)
+    ours = FeakmNet(replace(TINY.net, keypoints=keypoints)).eval()
+    theirs = copy.deepcopy(ours).to(device)
+    both = cache.draw(0, 0)
+    found = []
+    for net in (ours, theirs):
+        with torch.no_grad():
+            points = net.describe([both.ego, both.other])
+        batches = [KeypointBatch.of([one]) for one in points]
+        found.append((points, net.match(*batches)))
+    (mine, matched), (its, rematched) = found
+    assert theirs.device == device and len(mine[0]) > 5
+    for a, b in zip(mine, its, strict=True):
+        assert b.descriptor.device.type == b.boxes.center.device.type == "cpu" and type(b.descriptor) is torch.Tensor
+        assert torch.equal(a.xy, b.xy) and torch.allclose(a.descriptor, b.descriptor, atol=1e-5)
+    assert rematched.pairs.device.type == "cpu" and torch.equal(matched.pairs, rematched.pairs)
+    assert torch.allclose(matched.probability, rematched.probability, atol=1e-5)

@@ -37,7 +37,7 @@ def encode_map_features(
     with torch.inference_mode():
         features = model.extract_features(
             [frame.points] if "lidar" in sensors else (), [frame.images] if "camera" in sensors else ()
-        )
+        ).to(frame.points.xyz.device)
     clamped = features.tokens.with_features(make_map_token_format(model).clamp(features.tokens.features))
     tokens, score = select_within_budget(clamped, features.cell_score, budget_bytes, token_encoding)
     if not len(tokens.sites):

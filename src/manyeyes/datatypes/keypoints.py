@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from manyeyes.datatypes.boxes import Boxes
@@ -38,6 +39,10 @@ class Keypoints:
     def xy(self) -> Tensor:
         """Positions (N, 2) in metres."""
         return self.boxes.center[:, :2]
+
+    def to(self, device: torch.device) -> Keypoints:
+        """Return the same points on a device."""
+        return Keypoints(self.boxes.to(device=device), self.descriptor.to(device))
 
     def transform(self, target_from_source: Transform) -> Keypoints:
         """Return the same points in another frame; descriptors stay as they are."""

@@ -80,18 +80,22 @@ class BevConfig:
         return self.grid.at(2)
 
 
-def rasterise_clouds(clouds: Sequence[PointCloud], grid: BevGrid) -> tuple[Tensor, Tensor]:
+def rasterise_clouds(
+    clouds: Sequence[PointCloud], grid: BevGrid, device: torch.device | None = None
+) -> tuple[Tensor, Tensor]:
     """Rasterise the clouds of N agents, each in its own frame; returns (N, 13, rows, columns) and occupancy (N, rows,
     columns).
 
-    The channels are the twelve scaled moments of a pillar and its occupancy; empty pillars are zero.
+    The channels are the twelve scaled moments of a pillar and its occupancy; empty pillars are zero. device: where the raster is
+    made; None for that of the clouds.
     """
     cloud = PointCloud.cat(list(clouds))
-    device = cloud.xyz.device
+    device = device or cloud.xyz.device
+    xyz, intensity = cloud.xyz.to(device), cloud.intensity.to(device)
     batch = torch.cat([torch.full((len(c),), agent, device=device) for agent, c in enumerate(clouds)])
-    pillars = pillar_sites(cloud.xyz, batch, grid, len(clouds))
+    pillars = pillar_sites(xyz, batch, grid, len(clouds))
     kept = pillars.inside
-    moments = pillar_moments(cloud.xyz[kept], cloud.intensity[kept], pillars.row, pillars.sites)
+    moments = pillar_moments(xyz[kept], intensity[kept], pillars.row, pillars.sites)
     rows, columns = grid.shape
     raster = moments.new_zeros(len(clouds) * rows * columns, len(MOMENTS) + 1)
     raster[pillars.sites.key, :-1] = moments * moments.new_tensor(_SCALE)
@@ -138,7 +142,7 @@ class LidarBev(_RasterEncoder):
 
     def forward(self, clouds: Sequence[PointCloud]) -> tuple[Tensor, Tensor]:
         """Encode N clouds to features (N, C, h, w) on the token grid, and the observed mask (N, h, w)."""
-        raster, hit = rasterise_clouds(clouds, self.grid)
+        raster, hit = rasterise_clouds(clouds, self.grid, next(self.parameters()).device)
         return self.encode(raster), F.max_pool2d(hit[:, None].float(), 5, 2, 2)[:, 0] > 0
 
 
@@ -165,7 +169,7 @@ class CameraBev(_RasterEncoder):
         height, width = config.image_size
         cameras = [image.camera.resize(width, height) for image in flat]
         rig = AgentCameras(cameras, owner, len(images))
-        rgb = torch.cat([_resize(image.rgb, config.image_size) for image in flat])
+        rgb = torch.cat([_resize(image.rgb, config.image_size) for image in flat]).to(owner.device)
         outputs = self.project(self.encoder(rgb.contiguous(memory_format=torch.channels_last)))
         features, stride = outputs[:, : config.raster_channels], config.image_encoder.stride
         if config.view_transform == "ground":

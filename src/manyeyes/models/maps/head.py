@@ -294,7 +294,7 @@ def decode_elements(raw: RawMap, tile: BevGrid, config: MapHeadConfig) -> list[M
     size = np.array([tile.x_max, tile.y_max]) - low
     code = np.array([KINDS.index(kind) for kind in config.kinds])
     out = []
-    for scores, points in zip(score, raw.point.detach().clamp(0, 1).double()):
+    for scores, points in zip(score.cpu(), raw.point.detach().clamp(0, 1).double().cpu()):
         value, order = scores.flatten().sort(descending=True, stable=True)
         kept = order[: config.max_elements][value[: config.max_elements] >= config.score_threshold]
         query, kind = (kept // scores.shape[1]).numpy(), (kept % scores.shape[1]).numpy()

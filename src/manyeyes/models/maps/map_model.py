@@ -65,6 +65,10 @@ class MapFeatures:
         """(N,) maximum class probability; under a budget the highest are sent."""
         return self.line_logits.detach().sigmoid().amax(1)
 
+    def to(self, device: torch.device) -> MapFeatures:
+        """Return the same features on a device."""
+        return MapFeatures(self.tokens.to(device), self.line_logits.to(device))
+
 
 class MapModel(nn.Module):
     """Predict the map elements of tiles from the sensor data of several frames."""
@@ -99,6 +103,11 @@ class MapModel(nn.Module):
             nn.Buffer(torch.ones(len(head.kinds), device="cpu")),
             nn.Buffer(torch.zeros(len(head.kinds), device="cpu")),
         )
+
+    @property
+    def device(self) -> torch.device:
+        """The device of the weights, where clouds, images and tokens are moved to; agents keep to the CPU."""
+        return self.empty_feature.device
 
     @property
     def token_grid(self) -> BevGrid:
@@ -148,6 +157,7 @@ class MapModel(nn.Module):
             columns).
         """
         rows, columns = self.config.tile.shape
+        tokens, tile_index = tokens.to(self.device), tile_index.to(self.device)
         dense = tokens.dense()
         there = dense.new_zeros(dense.shape[0] * dense.shape[2] * dense.shape[3], dtype=torch.bool)
         there[tokens.sites.key] = True

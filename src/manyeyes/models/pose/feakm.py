@@ -15,7 +15,7 @@ from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.models import checkpoint
 from manyeyes.models.pose.box_descriptors import BoxKeypointConfig, BoxKeypointNet
 from manyeyes.models.pose.keypoint_net import DenseKeypointConfig, DenseKeypointNet, DetectorView
-from manyeyes.models.pose.matcher import KeypointBatch, Matcher, MatcherConfig, find_mutual_matches
+from manyeyes.models.pose.matcher import Assignment, KeypointBatch, Matcher, MatcherConfig, find_mutual_matches
 from manyeyes.models.pose.neighbour_geometry import NeighbourGeometryConfig
 
 FORMAT = "manyeyes-feakm-1"
@@ -51,13 +51,24 @@ class FeakmNet(nn.Module):
         self.keypoints = DenseKeypointNet(kind) if isinstance(kind, DenseKeypointConfig) else BoxKeypointNet(kind)
         self.matcher = Matcher(config.matcher)
 
+    @property
+    def device(self) -> torch.device:
+        """The device of the weights."""
+        return self.matcher.position_encoder.weight.device
+
+    def assign(self, a: KeypointBatch, b: KeypointBatch) -> list[Assignment]:
+        """Return the assignment of every layer of the matcher, on the device of the weights; the last is the result."""
+        return self.matcher(a.to(self.device), b.to(self.device))
+
     def describe(self, views: Sequence[DetectorView], group_size: int = 0) -> list[Keypoints]:
         """Compute keypoints of views in groups of group_size (0: all).
 
         A sender describes one view; FeaKM's code describes pairs. The group size matters only for the published
-        descriptors.
+        descriptors. Keypoints are returned on the device of the views, wherever the weights are.
         """
-        return self.keypoints(views, group_size)
+        device = self.device
+        described = self.keypoints([view.to(device) for view in views], group_size)
+        return [points.to(view.confidence.device) for points, view in zip(described, views)]
 
     @torch.no_grad()
     def match(self, ego_keypoints: KeypointBatch, other_keypoints: KeypointBatch) -> Matches:
@@ -65,11 +76,10 @@ class FeakmNet(nn.Module):
         if not ego_keypoints.mask.any() or not other_keypoints.mask.any():
             none = ego_keypoints.xy.new_zeros(0)
             return Matches(none.new_zeros(0, 2, dtype=torch.int64), none)
-        return Matches(
-            *find_mutual_matches(self.matcher(ego_keypoints, other_keypoints)[-1], self.config.matcher.min_match_prob)[
-                0
-            ]
-        )
+        assignment = self.assign(ego_keypoints, other_keypoints)[-1]
+        pairs, probability = find_mutual_matches(assignment, self.config.matcher.min_match_prob)[0]
+        device = ego_keypoints.xy.device
+        return Matches(pairs.to(device), probability.to(device))
 
     def check_views(self, detector: bytes) -> None:
         """Raise ConfigError where the network was trained on views of another detector than this fingerprint."""

@@ -47,6 +47,10 @@ class DetectorView:
                 f"{tuple(self.confidence.shape)} on {self.tokens.sites.batch_size} grids."
             )
 
+    def to(self, device: torch.device) -> DetectorView:
+        """Return the same view on a device."""
+        return DetectorView(self.tokens.to(device), self.confidence.to(device), self.boxes.to(device=device))
+
     @classmethod
     def of(cls, shared_tokens: SparseBev, boxes: Boxes) -> DetectorView:
         """Make a view from shared tokens (N, C + PROPOSAL_DIM) and the agent's own boxes."""

@@ -83,6 +83,10 @@ class KeypointBatch:
             pad([k.xy.new_ones(len(k)) for k in keypoints]).bool(),
         )
 
+    def to(self, device: torch.device) -> KeypointBatch:
+        """Return the same keypoints on a device."""
+        return KeypointBatch(*(column.to(device) for column in vars(self).values()))
+
 
 @dataclass(frozen=True, eq=False)
 class Assignment:

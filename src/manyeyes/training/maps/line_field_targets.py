@@ -55,6 +55,10 @@ class LineFieldTarget:
     direction: Tensor
     half_width: Tensor
 
+    def to(self, device: torch.device) -> LineFieldTarget:
+        """Return the same target on a device."""
+        return LineFieldTarget(*(column.to(device) for column in vars(self).values()))
+
     def mask_unobserved(self, seen: Tensor) -> LineFieldTarget:
         """Remove lines outside the observed mask (rows, columns)."""
         return replace(

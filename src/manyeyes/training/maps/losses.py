@@ -104,7 +104,7 @@ def match_queries(logit: Tensor, point: Tensor, target: MapTarget, config: MapLo
         distance = torch.cdist(point.flatten(1), target.orders.flatten(0, 1).flatten(1), p=1).view(-1, elements, orders)
         min_distance, best = distance.min(2)
         cost = config.classification * _focal_cost(logit)[:, target.kind] + config.point * min_distance
-        pairs = torch.from_numpy(np.stack(linear_sum_assignment(cost.double().numpy()), 1))
+        pairs = torch.from_numpy(np.stack(linear_sum_assignment(cost.double().cpu().numpy()), 1)).to(point.device)
         query, element = pairs[
             min_distance[pairs[:, 0], pairs[:, 1]] <= config.max_match_distance * point.shape[1]
         ].unbind(1)

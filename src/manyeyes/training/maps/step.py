@@ -59,17 +59,14 @@ def loss_terms(
     drop_fraction: (frames,) fraction of each frame's tokens that is dropped. train_decoder: whether to compute
     decoder losses.
     """
-    extracted = extract_features(model, samples)
-    occupied = (
-        torch.cat([sample.line_mask for sample in samples])
-        .permute(0, 2, 3, 1)
-        .flatten(0, 2)[extracted.tokens.sites.key]
-    )
+    extracted, device = extract_features(model, samples), model.device
+    line_mask = torch.cat([sample.line_mask for sample in samples]).to(device)
+    occupied = line_mask.permute(0, 2, 3, 1).flatten(0, 2)[extracted.tokens.sites.key]
     segmentation = segmentation_loss(extracted.line_logits, occupied.float())
     tokens = (
         extracted.tokens
         if drop_fraction is None
-        else subsample_tokens(extracted.tokens, extracted.cell_score, drop_fraction)
+        else subsample_tokens(extracted.tokens, extracted.cell_score, drop_fraction.to(device))
     )
     features, seen = warp_tokens(model, tokens, samples)
     ground = model.fuse_features(features, seen)
@@ -77,12 +74,13 @@ def loss_terms(
     around = dilate_observed(seen.any(1), tile)
     line_field = model.predict_line_field(ground)
     line_targets = [
-        make_line_field_target(one.truth, tile, head.kinds).mask_unobserved(part) for one, part in zip(samples, around)
+        make_line_field_target(one.truth, tile, head.kinds).to(device).mask_unobserved(part)
+        for one, part in zip(samples, around)
     ]
     line_loss = line_field_loss(line_field, line_targets)
     if not train_decoder:
         return MapLossTerms.without_elements(segmentation, line_loss)
-    truths = [select_observed(one.truth, part, tile) for one, part in zip(samples, around)]
-    targets = [make_map_target(truth, tile, head.kinds, head.num_points) for truth in truths]
+    truths = [select_observed(one.truth, part, tile) for one, part in zip(samples, around.cpu())]
+    targets = [make_map_target(truth, tile, head.kinds, head.num_points).to(device) for truth in truths]
     many = model.predict_elements(ground, "many", line_field) if head.num_one_to_many_queries else ()
     return map_terms(model.predict_elements(ground, "one", line_field), many, segmentation, line_loss, targets, config)

@@ -41,6 +41,10 @@ class MapTarget:
     def __len__(self) -> int:
         return self.kind.shape[0]
 
+    def to(self, device: torch.device) -> MapTarget:
+        """Return the same elements on a device."""
+        return MapTarget(*(column.to(device) for column in vars(self).values()))
+
     def repeat(self, times: int) -> MapTarget:
         """Repeat every element, for one-to-many matching."""
         return MapTarget(*(column.repeat(times, *(1,) * (column.dim() - 1)) for column in vars(self).values()))
@@ -63,9 +67,7 @@ def make_map_target(truth: MapElements, tile: BevGrid, kinds: Sequence[str], poi
 
 
 def select_observed(truth: MapElements, seen: Tensor, tile: BevGrid) -> MapElements:
-    """Select the elements of which at least MIN_OBSERVED_FRACTION of the length lies in observed cells (rows,
-    columns).
-    """
+    """Select the elements with at least MIN_OBSERVED_FRACTION of their length in observed cells (rows, columns), on the CPU."""
     if not len(truth):
         return truth
     points, first = resample_spaced(truth.points, truth.offsets, tile.cell_size_m / 2)

@@ -103,6 +103,10 @@ class GroundTruthMatches:
     unmatched_a: Tensor
     unmatched_b: Tensor
 
+    def to(self, device: torch.device) -> GroundTruthMatches:
+        """Return the same matches on a device."""
+        return GroundTruthMatches(*(column.to(device) for column in vars(self).values()))
+
 
 def match_ground_truth(
     a: Sequence[Keypoints],
@@ -178,8 +182,9 @@ class FeakmTask(Task[FeakmTrainConfig, FeakmNet, ViewPair]):
         config = self.config
         ego, other, motions = self._keypoints(model, samples, numbers.start)
         truth = match_ground_truth(ego, other, motions, config.match_radius_m, config.unmatched_radius_m)
+        truth = truth.to(model.device)
         ego, other = (self._perturb(side, name, numbers.start) for side, name in ((ego, "ego"), (other, "other")))
-        layers = model.matcher(KeypointBatch.of(ego), KeypointBatch.of(other))
+        layers = model.assign(KeypointBatch.of(ego), KeypointBatch.of(other))
         measures = matching_recall_precision(layers[-1], truth, config.net.matcher.min_match_prob)
         return matching_loss(layers, truth), dict(
             zip(self.shown_terms, torch.tensor(measures, dtype=torch.float64, device="cpu"))
