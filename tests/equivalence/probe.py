@@ -129,21 +129,24 @@ def trained_weights(data: Path) -> Arrays:
         yield f"training/weights/{number}", value.numpy()
 
 
+FORMER_ERRORS = ("--noise-in-time", "independent", "--claimed-covariance", "true", "--no-odometry-drift")
+"""Pose errors as they were in older code."""
 STUDIES: dict[str, tuple[str, ...]] = {
-    "evaluate": ("evaluate", "--methods", "none", "late", "intermediate"),
-    "robustness": ("study", "robustness", "--methods", "late", "--perturbations", "0.8 m"),
+    "evaluate": ("evaluate", "--methods", "no-fusion", "late", "intermediate-temporal"),
+    "robustness": ("study", "robustness", "--methods", "late", "--perturbations", "0.8 m", *FORMER_ERRORS),
     "budget": (
         "study",
         "bandwidth",
         "--methods",
         "late",
         "--token-selection",
-        "intermediate-confidence",
+        "intermediate-confidence-temporal",
         "--budgets",
         "4096",
+        *FORMER_ERRORS,
     ),
-    "agents": ("study", "num-agents", "--methods", "intermediate"),
-    "pose": ("study", "pose-noise-ap", "--correctors", "voting", "--perturbations", "0.8 m"),
+    "agents": ("study", "num-agents", "--methods", "intermediate-temporal", *FORMER_ERRORS),
+    "pose": ("study", "pose-noise-ap", "--correctors", "voting", "--perturbations", "0.8 m", *FORMER_ERRORS),
 }
 UNTIMED = ("evaluate",)
 LEFT_OUT = ("_ms", "_s", "seconds", "iou", "bar")
