@@ -73,7 +73,7 @@ def test_sensors_has_a_row_for_each_recording_change_and_method(root, weights, t
     by_key = {(r["recording"], r["law"], r["sweeps"], r["tilt_deg"], r["method"]): r["ap"][0]["value"] for r in rows}
     assert all(value == by_key[("beams-32", *key[1:])] for key, value in by_key.items())
     assert all(r["below_best"]["value"] <= 0 for r in rows)
-    assert {"Sensors, none", "Sensors, intermediate"} <= {
+    assert {"Sensors, no-fusion", "Sensors, intermediate"} <= {
         line.removeprefix("## ") for line in (tmp_path / "sensors.md").read_text().splitlines()
     }
     assert (tmp_path / "sensors.png").exists() and result["comparisons"]
