@@ -151,3 +151,19 @@ def test_differences_are_paired_and_may_be_over_some_scenarios_alone() -> None:
     kept = [match for match in a if match.scenario in some]
     assert grid.bootstrap_ap(("x", "a"), 1, scenarios=some) == bootstrap(kept, protocol=protocol).interval()
     assert grid.scenarios_of(("x", "a")) == {"s0", "s1", "s2", "s3"}
+
+
+def test_answers_of_methods_are_compared_though_their_truth_differs() -> None:
+    """Methods answer at times of their own: in b's answers a vehicle has left the range."""
+    a, b = make_result("a", (4, 3, 2, 4)), make_result("b", (2, 2, 1, 2))
+    fewer = tuple(replace(frame, n_gt=3) for frame in b.matches[0])
+    results = {
+        ("x", "a"): replace(a, answer_matches=a.matches, answer_ms=120.0),
+        ("x", "b"): replace(b, answer_matches=(fewer, fewer)),
+    }
+    grid = ResultGrid(results, PROTOCOLS["global-sort"])
+    assert grid.answer_ap_pair(("x", "a"))[0] == grid.ap_pair(("x", "a"))[0]
+    compared = grid.compare_answers("a - b", ("x", "a"), ("x", "b"), 1)
+    values = [grid.answer_ap_pair(key)[1].value for key in results]
+    assert compared.metric == "AP@0.7 at the answer" and compared.interval.value == pytest.approx(values[0] - values[1])
+    assert values[1] > grid.ap_pair(("x", "b"))[1].value

@@ -214,7 +214,9 @@ class ResultGrid:
         if cache_key not in self._bootstraps:
             name = self.protocol.class_name
             frames = [match for match in self.results[key].answer_matches[iou] if match.class_name == name]
-            self._bootstraps[cache_key] = bootstrap(frames, protocol=self.protocol)
+            # Methods answer at times of their own, at which other objects may be in range.
+            samples = bootstrap(frames, protocol=self.protocol)
+            self._bootstraps[cache_key] = replace(samples, same_truth=False)
         return self._bootstraps[cache_key]
 
     def _bootstrap(
