@@ -50,7 +50,7 @@ def test_presets_differ_in_the_fusion_alone() -> None:
         assert rest == reference
 
 
-@pytest.mark.parametrize("preset", FUSION_TRAINING_PRESETS)
+@pytest.mark.parametrize("preset", [name for name in FUSION_TRAINING_PRESETS if not name.startswith("stage-c/")])
 def test_a_preset_takes_every_tensor_of_its_base(preset: str, tmp_path) -> None:
     base = Detector(FUSION_PLANS[base_of(preset)].stages[-1][1].detector)
     path = tmp_path / "base.safetensors"

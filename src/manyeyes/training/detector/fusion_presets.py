@@ -4,6 +4,7 @@
 stage-a: the schedule of costr-small, of which every view is trained by itself. ``fusion/NAME`` and ``fusion/NAME/bare`` start from
 its weights, add a fusion drawn from the seed, and train everything on, with the same optimiser, steps, samples and degradation. A
 bare fusion has no history, so that its samples have none.
+``stage-c/NAME``: 10,000 steps from random weights.
 ``table3/ROW``: rows of CoSTr's Table III by the same recipe. The base of a row has its parts and no other: ``stage-a/BASE``, or
 ``stage-a`` where the parts are all there.
 """
@@ -34,6 +35,8 @@ INSIDE_FUSIONS = (
 """Fusions in mode inside."""
 BARE_FUSIONS = ("max", "attfuse", "v2vnet", "v2x-vit", "where2comm", "disconet", "sparsealign")
 """Fusions in mode bare: features alone are sent."""
+STAGE_C_FUSIONS = INSIDE_FUSIONS
+"""Fusions with a preset that starts from random weights, to show whether the recipe decides the order."""
 
 _FINAL = DETECTOR_TRAINING_PRESETS["costr-small/stage4"]
 _STAGE_B = replace(_FINAL, steps=STEPS, learning_rate=1e-3, warmup_steps=100, prune_warmup_end=0.001)
@@ -46,6 +49,11 @@ class TableRow:
     base: str
     fusion: str
     changes: dict[str, Any]
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether nothing but the fusion differs: the run is that of ``fusion/NAME``."""
+        return not self.changes
 
 
 _FINE_ONLY = replace(_FINAL.detector.encoder, use_coarse_strides=False, prune_strides=())
@@ -75,6 +83,12 @@ def _stage_b(fusion: str, **changes: Any) -> DetectorTrainConfig:
     return replace(config, degradation=replace(config.degradation, ego_history=0, sender_history=0))
 
 
+def _stage_c(fusion: str) -> DetectorTrainConfig:
+    """Return 10,000 steps of the whole detector from random weights, with the samples of stage B."""
+    config = replace(_stage_b(fusion), steps=10_000, learning_rate=1.5e-3, warmup_steps=200)
+    return replace(config, prune_warmup_start=0.02, prune_warmup_end=0.10)
+
+
 def _stage_a(**changes: Any) -> TrainPlan:
     """Return the stages of costr-small without a fusion: that of stage-a has no weights, and is not computed."""
     stages = []
@@ -91,6 +105,7 @@ def _stage_a(**changes: Any) -> TrainPlan:
 FUSION_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {
     **{f"fusion/{name}": _stage_b(name) for name in INSIDE_FUSIONS},
     **{f"fusion/{name}/bare": _stage_b(f"{name}/bare") for name in BARE_FUSIONS},
+    **{f"stage-c/{name}": _stage_c(name) for name in STAGE_C_FUSIONS},
     **{f"table3/{name}": _stage_b(row.fusion, **row.changes) for name, row in TABLE3_ROWS.items()},
 }
 FUSION_PLANS: dict[str, TrainPlan] = {
