@@ -36,7 +36,7 @@ from manyeyes.pose.feakm import FeakmCorrector
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.pose_graph import RelativePoseEdge, optimize_poses
 from manyeyes.pose.pose_monitor import PoseHealth, PoseMonitorConfig, PoseMonitorState, PoseReport, update_monitor
-from manyeyes.pose.registry import load_corrector
+from manyeyes.pose.registry import find_joint_corrector, load_corrector
 from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, lift_to_se3
 
 Floats = NDArray[np.float64]
@@ -182,7 +182,7 @@ class PoseCorrection:
                     load_corrector(self.corrector)(own, landmarks[n], propagated_prior),
                 )
                 propagated.add(n)
-        joint, inconsistent = self._optimize_jointly(messages, landmarks, priors, pairwise_estimates)
+        joint, inconsistent = self._optimize_jointly(messages, (own, *landmarks), priors, pairwise_estimates)
         kept, corrections = [], []
         for n, message in enumerate(messages):
             estimate = joint.get(n, pairwise_estimates[n])
@@ -284,11 +284,19 @@ class PoseCorrection:
         priors: Sequence[PosePrior | None],
         pairwise_estimates: Sequence[PoseEstimate],
     ) -> tuple[dict[int, PoseEstimate], set[int]]:
-        """Joint estimates of the senders' poses where pairs of senders match too; and the isolated senders."""
+        """Joint estimates of the senders' poses where pairs of senders match too; and the isolated senders.
+
+        landmarks: of the ego, then of the senders.
+        """
+        correct_jointly = find_joint_corrector(self.corrector)
+        if correct_jointly is not None:
+            estimates = correct_jointly(landmarks, priors)
+            return {n: estimate for n, estimate in enumerate(estimates) if estimate.status.has_estimate}, set()
         ego_edges = [_make_edge(EGO_NODE, n + 1, pairwise) for n, pairwise in enumerate(pairwise_estimates)]
         sender_edges = []
         for i, j in itertools.combinations(range(len(messages)), 2):
-            estimate = load_corrector(self.corrector)(landmarks[i], landmarks[j], _make_prior(messages[i], messages[j]))
+            prior = _make_prior(messages[i], messages[j])
+            estimate = load_corrector(self.corrector)(landmarks[i + 1], landmarks[j + 1], prior)
             sender_edges.append(_make_edge(i + 1, j + 1, estimate))
         if not any(sender_edges):
             return {}, set()

@@ -8,7 +8,7 @@ a path that ends in .safetensors one of 'manyeyes train'; ``@8`` after either re
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
@@ -56,6 +56,27 @@ def register_pose_corrector(name: str, kind: Kind = "landmarks") -> Callable[[Fu
         return function
 
     return decorate
+
+
+JointCorrector = Callable[[Sequence[Landmarks], Sequence[PosePrior | None]], list[PoseEstimate]]
+"""Corrects all agents at once: landmarks of the ego, then of the others, and the priors of the others."""
+_JOINT_CORRECTORS: dict[str, JointCorrector] = {}
+
+
+def register_joint_corrector(name: str) -> Callable[[JointCorrector], JointCorrector]:
+    """Register how the corrector of a name corrects several agents at once, as a decorator."""
+
+    def decorate(function: JointCorrector) -> JointCorrector:
+        _JOINT_CORRECTORS[name] = function
+        return function
+
+    return decorate
+
+
+def find_joint_corrector(name: str) -> JointCorrector | None:
+    """Return how the corrector of a name corrects several agents at once; None if it knows pairs alone."""
+    find_corrector(name)
+    return _JOINT_CORRECTORS.get(name)
 
 
 def list_correctors(*kinds: Kind) -> tuple[str, ...]:
