@@ -58,6 +58,7 @@ def test_maps_of_senders() -> None:
     assert maps.sites.batch_size == 3 and maps.is_own.tolist() == (maps.sites.batch == 0).tolist()
     assert torch.equal(maps.features[maps.is_own], rows.features[rows.is_own])
     assert torch.equal(rows.sites.yx[maps.cell], maps.sites.yx)
+    assert torch.equal(maps.to_rows(maps.features), rows.features)
     second = SparseBev(maps.features, maps.sites).dense()[1]
     mine = (rows.agent == 1).nonzero()[:, 0]
     y, x = rows.sites.yx[rows.cell[mine]].unbind(1)

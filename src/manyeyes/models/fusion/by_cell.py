@@ -31,12 +31,18 @@ class SenderMaps:
         sites: of the maps of all senders of all egos, a batch of grids.
         cell: (M,) int64, as in CellRows.
         is_own: (M,) bool, whether the map is that of the ego; its rows are in the order of the cells.
+        row: (M,) int64, the row of CellRows.
     """
 
     features: Tensor
     sites: Sites
     cell: Tensor
     is_own: Tensor
+    row: Tensor
+
+    def to_rows(self, values: Tensor) -> Tensor:
+        """Return values (M, D) of the sites in the order of the rows."""
+        return torch.zeros_like(values).index_copy(0, self.row, values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +129,7 @@ class CellRows:
         key = self.agent * (rows * columns) + self.sites.key.remainder(rows * columns)[self.cell]
         key, order = key.sort()
         sites = Sites(key, self.sites.grid, self.sites.batch_size * self.num_senders)
-        return SenderMaps(self.features.index_select(0, order), sites, self.cell[order], self.is_own[order])
+        return SenderMaps(self.features.index_select(0, order), sites, self.cell[order], self.is_own[order], order)
 
     def with_own_everywhere(self) -> CellRows:
         """Return the rows and, on cells where the ego has none, a row of zeros of the ego: its dense map."""

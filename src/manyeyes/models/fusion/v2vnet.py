@@ -13,25 +13,11 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import SparseBev
-from manyeyes.models.detector.layers import conv_weight
 from manyeyes.models.detector.transformer import AttentionConfig
+from manyeyes.models.fusion._layers import PlainConv
 from manyeyes.models.fusion.by_cell import AbsentSenders, CellRows, SenderMaps
 from manyeyes.models.fusion.cell_fusion import register_rule
-from manyeyes.ops.sparse_conv import submanifold_conv
 from manyeyes.ops.voxelize import segment_sum
-
-
-class SparseConv(nn.Module):
-    """3x3 convolution with bias on the same sites, without norm or ReLU."""
-
-    def __init__(self, inputs: int, outputs: int, bias: bool = True) -> None:
-        super().__init__()
-        self.weight = conv_weight(outputs, inputs, 3)
-        self.bias = nn.Parameter(torch.zeros(outputs, device="cpu")) if bias else None
-
-    def forward(self, x: SparseBev) -> Tensor:
-        """Map (N, inputs) to (N, outputs)."""
-        return submanifold_conv(x, self.weight, self.bias).features
 
 
 class ConvGru(nn.Module):
@@ -39,7 +25,7 @@ class ConvGru(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.gates, self.candidate = SparseConv(2 * channels, 2 * channels), SparseConv(2 * channels, channels)
+        self.gates, self.candidate = PlainConv(2 * channels, 2 * channels), PlainConv(2 * channels, channels)
 
     def forward(self, x: Tensor, hidden: SparseBev) -> Tensor:
         """Update hidden features (N, C) by inputs x (N, C) of the same sites."""
@@ -61,8 +47,8 @@ class V2VNet(nn.Module):
         super().__init__()
         self.absent, self.iterations = absent, iterations
         self.from_sender, self.from_receiver = (
-            SparseConv(channels, channels, bias=False),
-            SparseConv(channels, channels),
+            PlainConv(channels, channels, bias=False),
+            PlainConv(channels, channels),
         )
         self.gru, self.out = ConvGru(channels), nn.Linear(channels, channels)
 

@@ -29,11 +29,14 @@ INSIDE_FUSIONS = (
     "disconet",
     "where2comm",
     "sparsealign",
+    "how2comm",
+    "ermvp",
+    "instances",
     "self-attention",
     "multi-scale",
 )
-"""Fusions in mode inside."""
-BARE_FUSIONS = ("max", "attfuse", "v2vnet", "v2x-vit", "where2comm", "disconet", "sparsealign")
+"""Fusions in mode inside; instances is our own arm, the merge by distance."""
+BARE_FUSIONS = ("max", "attfuse", "v2vnet", "v2x-vit", "where2comm", "disconet", "sparsealign", "how2comm", "ermvp")
 """Fusions in mode bare: features alone are sent."""
 STAGE_C_FUSIONS = INSIDE_FUSIONS
 """Fusions with a preset that starts from random weights, to show whether the recipe decides the order."""
