@@ -19,6 +19,9 @@ settings.register_profile("fast", CI, max_examples=20)
 settings.register_profile("nightly", CI, max_examples=2000, derandomize=False, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
+# Golden numbers are those of float32 products; tests of bfloat16 name it.
+os.environ["MANYEYES_BFLOAT16"] = "0"
+
 _MAPS = Path(__file__).resolve().parents[2] / "shared" / "data"
 if _MAPS.is_dir():
     os.environ.setdefault("MANYEYES_MAPS", str(_MAPS))

@@ -6,10 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from manyeyes.datatypes import CheckpointError
+from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.models import checkpoint, pretrained
 from manyeyes.models.maps.map_model import MapModel
 from manyeyes.models.maps.presets import FORMAT, MAP_TINY
+from manyeyes.ops._sparse_conv_kernels import HAS_BFLOAT16
 
 
 @pytest.fixture
@@ -50,3 +51,19 @@ def test_unknown_map_model_error_lists_the_shipped_ones(package):
         pretrained.load_map_model("map-large")
     with pytest.raises(CheckpointError, match="no such file"):
         pretrained.load_map_model("map-large.safetensors")
+
+
+def test_bfloat16_is_chosen_where_the_processor_has_it_and_can_be_switched_off(monkeypatch):
+    """In pairs, two inputs to a word: the matrices of an attention block are half as long."""
+
+    def is_paired(detector):
+        return detector.fusion.transformer.blocks[0].folded.matrices.query.dtype.kind == "i"
+
+    assert not is_paired(pretrained.load())
+    assert is_paired(pretrained.load(in_bfloat16=True)) == HAS_BFLOAT16
+    monkeypatch.delenv(pretrained.BFLOAT16_VARIABLE)
+    assert is_paired(pretrained.load()) == HAS_BFLOAT16
+    assert not is_paired(pretrained.load(in_bfloat16=False))
+    monkeypatch.setenv(pretrained.BFLOAT16_VARIABLE, "yes")
+    with pytest.raises(ConfigError, match=r"MANYEYES_BFLOAT16 is 0 .* got 'yes'"):
+        pretrained.load()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.resources import as_file, files
@@ -10,7 +11,7 @@ from pathlib import Path
 
 from torch import Tensor
 
-from manyeyes.datatypes import CheckpointError
+from manyeyes.datatypes import CheckpointError, ConfigError
 from manyeyes.datatypes.registry import Registry
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.fold_norms import fold_norms
@@ -25,6 +26,8 @@ DEFAULT_FEAKM = "feakm-small"
 """The shipped FeaKM network. It is not a detector, so list_detectors leaves it out."""
 DEFAULT_MAP_MODEL = "map-small-lidar"
 """The map model for LiDAR; map-small-camera and map-small-fusion take images, or both."""
+BFLOAT16_VARIABLE = "MANYEYES_BFLOAT16"
+"""Environment variable that switches products of bfloat16 off, by 0."""
 _MAP_PREFIX = "map-"
 
 _DETECTORS: Registry[Callable[[], BoxDetector]] = Registry("detector", "manyeyes.detector")
@@ -53,16 +56,20 @@ def _shipped() -> tuple[str, ...]:
     return tuple(sorted(Path(f.name).stem for f in found if f.name.endswith(".safetensors")))
 
 
-def load(name_or_path: str | Path = DEFAULT_DETECTOR) -> BoxDetector:
+def load(name_or_path: str | Path = DEFAULT_DETECTOR, *, in_bfloat16: bool | None = None) -> BoxDetector:
     """Load a detector for inference; norms of shipped and trained weights are folded into the convolutions.
 
-    To continue training, or to inspect the stored weights, use checkpoint.load.
+    To continue training, or to inspect the stored weights, use checkpoint.load. Fingerprint and messages do not depend on
+    in_bfloat16: agents with and without it decode each other's tokens.
 
     Args:
         name_or_path: a shipped name, a registered name, or a .safetensors file written by 'manyeyes train'.
+        in_bfloat16: encoder and attention multiply bfloat16 with float32 sums where the processor has such products
+            (``fold_norms``). None: unless the environment variable MANYEYES_BFLOAT16 is 0.
 
     Raises:
-        CheckpointError: there are no such weights. ConfigError: a registered detector lacks something.
+        CheckpointError: there are no such weights. ConfigError: a registered detector lacks something, or the variable is
+        neither 0 nor 1.
     """
     name, shipped = str(name_or_path), _shipped_detectors()
     if name in _DETECTORS and name not in shipped:
@@ -70,7 +77,17 @@ def load(name_or_path: str | Path = DEFAULT_DETECTOR) -> BoxDetector:
         check_detector(detector)
         return detector
     with _weights_file(name, list_detectors()) as path:
-        return fold_norms(checkpoint.load(path))
+        return fold_norms(checkpoint.load(path), _is_bfloat16_wanted() if in_bfloat16 is None else in_bfloat16)
+
+
+def _is_bfloat16_wanted() -> bool:
+    """Return whether weights may be multiplied in bfloat16 in this environment."""
+    value = os.environ.get(BFLOAT16_VARIABLE, "1")
+    if value not in ("0", "1"):
+        raise ConfigError(
+            f"{BFLOAT16_VARIABLE} is 0 (float32) or 1 (bfloat16 where the processor has it); got {value!r}."
+        )
+    return value == "1"
 
 
 def load_feakm(name_or_path: str | Path = DEFAULT_FEAKM) -> feakm.FeakmNet:

@@ -78,7 +78,6 @@ def cloud_moments(now: Sequence[PointCloud], before: Sequence[PointCloud], grid:
     _moments(points, key, rank, middle, out)
     features = torch.from_numpy(out)
     features[:, :, 0].log1p_()
-    features[:, :, 6:9].sqrt_()
     return SparseBev(features.flatten(1), Sites(torch.from_numpy(found), grid, len(now)))
 
 
@@ -177,7 +176,7 @@ def _reduce(
 
 @njit(cache=True, nogil=True)
 def _moments(points: _Points, key: I32x1, rank: I32x1, middle: F32x2, out: F32x3) -> None:  # pragma: no cover
-    """Write the moments of each sweep's points to out (N, sweeps, 12) of zeros: count and variances without their functions."""
+    """Write the moments of each sweep's points to out (N, sweeps, 12) of zeros; the count without its logarithm."""
     xyz, bright, young = points
     one, infinity = np.float32(1), np.float32(np.inf)
     out[:, :, 4], out[:, :, 5], out[:, :, 11] = infinity, -infinity, -infinity
@@ -213,4 +212,5 @@ def _moments(points: _Points, key: I32x1, rank: I32x1, middle: F32x2, out: F32x3
         for sweep in range(out.shape[1]):
             to = out[r, sweep]
             count = max(to[0], one)
-            to[6], to[7], to[8], to[9] = to[6] / count, to[7] / count, to[8] / count, to[9] / count
+            to[6], to[7], to[8] = np.sqrt(to[6] / count), np.sqrt(to[7] / count), np.sqrt(to[8] / count)
+            to[9] /= count

@@ -6,6 +6,7 @@ Without memory: the ego's tokens of the present sweep and the newest message of 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,11 +15,11 @@ import torch
 from torch import Tensor
 
 from manyeyes.agents.perception_cache import PerceptionCache
-from manyeyes.agents.strategies.message_header import age_s, ego_from_sender, make_header
+from manyeyes.agents.strategies.message_header import age_s, make_header
 from manyeyes.agents.strategies.redundancy import distinct_score
 from manyeyes.agents.strategies.registry import FusionStrategy, register_strategy
 from manyeyes.comms.request_map import compute_request_weights
-from manyeyes.datatypes import AgentFrame, Boxes, Message, SparseBev
+from manyeyes.datatypes import AgentFrame, Boxes, Message, SparseBev, Transform
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat
 from manyeyes.models.fusion.transform_tokens import AgentTokens, Tokens, to_ego_frame
 from manyeyes.ops.keyed_random import keyed_uniform
@@ -108,15 +109,17 @@ def gather_tokens(
     """
     own = cache.process_tokens(frame).shared_tokens
     on_grid = [(m, m.tokens) for m in messages if m.tokens is not None and m.tokens.grid == own.grid]
-    received = [_to_agent_tokens(frame, message, tokens.features, tokens.sites.xy) for message, tokens in on_grid]
+    ego_from_world = frame.world_from_agent.inverse()
+    received = [_to_agent_tokens(frame, ego_from_world, message, tokens) for message, tokens in on_grid]
     current = AgentTokens(0, own.features, own.sites.xy, is_infrastructure=frame.is_infrastructure)
     return to_ego_frame([current, *received, *past], own.grid, 1)
 
 
-def _to_agent_tokens(frame: AgentFrame, message: Message, features: Tensor, xy: Tensor) -> AgentTokens:
+def _to_agent_tokens(frame: AgentFrame, ego_from_world: Transform, message: Message, tokens: SparseBev) -> AgentTokens:
     """Return tokens in the ego's frame; the pose variances of ego and sender add up."""
-    variance = (frame.pose_covariance + message.pose_covariance).diagonal()
-    sigma_xy_m = float((variance[:2].mean()).clamp_min(0).sqrt())
-    sigma_yaw_rad = float(variance[2].clamp_min(0).sqrt())
-    motion, age, roadside = ego_from_sender(frame, message), age_s(frame, message), message.is_infrastructure
-    return AgentTokens(0, features, xy, motion, age, sigma_xy_m, sigma_yaw_rad, is_infrastructure=roadside)
+    x, y, yaw = (frame.pose_covariance + message.pose_covariance).diagonal().tolist()
+    motion, age, roadside = ego_from_world @ message.world_from_agent, age_s(frame, message), message.is_infrastructure
+    sigma_xy_m, sigma_yaw_rad = math.sqrt(max((x + y) / 2, 0.0)), math.sqrt(max(yaw, 0.0))
+    return AgentTokens(
+        0, tokens.features, tokens.sites.xy, motion, age, sigma_xy_m, sigma_yaw_rad, is_infrastructure=roadside
+    )

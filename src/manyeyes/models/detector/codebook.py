@@ -100,4 +100,4 @@ def residual_codes(features: Tensor, centres: Tensor) -> Tensor:
 
 def nearest_centre(x: Tensor, centres: Tensor) -> Tensor:
     """Return the index (N,) int64 of the nearest of centres (K, C) to each row of x (N, C); the first of ties."""
-    return (centres.square().sum(1) - 2 * (x @ centres.T)).argmin(1)
+    return torch.addmm(centres.square().sum(1), x, centres.T, alpha=-2).argmin(1)
