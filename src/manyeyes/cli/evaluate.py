@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,6 +17,7 @@ from manyeyes.studies.replay_options import display_name, make_excerpt
 if TYPE_CHECKING:
     from manyeyes.agents.replay import ReplayConfig
     from manyeyes.datasets.base import Recording
+    from manyeyes.evaluation.detection.accumulator import MethodResult
     from manyeyes.models.detector.protocols import BoxDetector
 
 
@@ -32,8 +34,7 @@ class Options(EvaluationOptions):
     all_egos: bool = False
     """Evaluate every agent as ego, not only the first."""
     thresholds: Path | None = None
-    """results.json of 'manyeyes evaluate' on a validation split, whose thresholds of greatest F give precision and recall; by
-    default those of the card of the weights."""
+    """results.json of 'manyeyes evaluate' on a validation split, whose score thresholds are used; by default the weights' own."""
     timing_frames: NonNegativeInt = 10
     """Frames of the first scenario on which each method is timed by itself; 0 leaves times out."""
 
@@ -58,6 +59,7 @@ def _evaluate(options: Options) -> None:
         resolve_protocol,
         run_benchmark,
     )
+    from manyeyes.models.pretrained import read_training_seed
     from manyeyes.studies import provenance
     from manyeyes.studies.recordings import adapt_to_dataset, check_evaluated_frames, check_files
     from manyeyes.studies.sensor_notes import print_sensor_note
@@ -89,28 +91,31 @@ def _evaluate(options: Options) -> None:
     with track(console, "Evaluating", len(recording.scenarios)) as report:
         results = run_benchmark(opener, config, options.workers, report, thresholds)
     results = [r for r in results if options.object_class in (None, r.class_name)]
-    times = {
-        name: _measure_times(name, recording, detector, config.replay, options.timing_frames)
-        for name in dict.fromkeys(result.method for result in results)
-    }
-    timed_results = [replace(r, share_ms=times[r.method][0], perceive_ms=times[r.method][1]) for r in results]
-    comparison = summarize_comparison(timed_results, protocol, missing)
+    timed_results = _add_times(results, recording, detector, config.replay, options.timing_frames)
+    seed = read_training_seed(options.replay_options.weights)
+    comparison = summarize_comparison(timed_results, protocol, missing, seed)
     data_name = f"{options.data.name}{f'/{options.split}' if options.split else ''}"
     title = f"{display_name(options.replay_options.weights)} on {data_name}: {len(recording.scenarios)} scenarios, {protocol.name}"
     note = "" if noise is None else errors.describe(options.seed)
     print_comparison(console, comparison, title)
     if note:
         console.print(note, highlight=False, soft_wrap=True)
-    provenance.write_json(
-        options.out / "results.json", comparison, {"options": options, "benchmark": config}, options.seed
-    )
     text = f"{title}\n\n{format_comparison_markdown(comparison)}"
-    if note:
-        text += f"\n{note}\n"
-    atomic_write_text(options.out / "results.md", text)
-    console.print(
-        f"\nNumbers, configuration and versions are in {options.out / 'results.json'}", highlight=False, soft_wrap=True
-    )
+    atomic_write_text(options.out / "results.md", f"{text}\n{note}\n" if note else text)
+    path = options.out / "results.json"
+    provenance.write_json(path, comparison, {"options": options, "benchmark": config}, options.seed)
+    console.print(f"\nNumbers, configuration and versions are in {path}", highlight=False, soft_wrap=True)
+
+
+def _add_times(
+    results: Sequence[MethodResult], recording: Recording, detector: BoxDetector, config: ReplayConfig, num_frames: int
+) -> list[MethodResult]:
+    """Return results with the times of their methods."""
+    times = {
+        name: _measure_times(name, recording, detector, config, num_frames)
+        for name in dict.fromkeys(result.method for result in results)
+    }
+    return [replace(r, share_ms=times[r.method][0], perceive_ms=times[r.method][1]) for r in results]
 
 
 def _measure_times(

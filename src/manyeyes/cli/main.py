@@ -31,6 +31,7 @@ COMMANDS = {
     "live": "agents as processes on a network: run one, demo of a team, replay of a recorded run",
     "keys": "keys and certificates of agents on a network: make, issue, verify, revoke",
     "study": "reproduce a table or figure: robustness, bandwidth, pose noise, map fusion, ...",
+    "report": "documents of results: docs",
     "doctor": "print what a bug report needs",
 }
 COMMAND_GROUPS = {
@@ -60,6 +61,7 @@ COMMAND_GROUPS = {
         "trust": "print the anchors, issuers and revocations of a trust file",
         "demo": "make a whole federation for tests: anchor, issuer, trust file, agents",
     },
+    "report": {"docs": "write tables of README and documents from stored results, or check them"},
     "study": {name: study.summary for name, study in STUDIES.items()},
 }
 MODULES = {"fit-codebook": "fit_codebook", "map import": "map import_predictions"}

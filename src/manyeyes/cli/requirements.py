@@ -94,6 +94,7 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
     "view": (_PILLOW,),
     "pose": (_GICP,),
     "doctor": (),
+    "report docs": (),
     "map build": (_ARROW, _SHAPELY, _MATPLOTLIB),
     "map simulate": (_ARROW, _SHAPELY),
     "map import": (_ARROW,),

@@ -114,6 +114,15 @@ def read_training_towns(name_or_path: str | Path = DEFAULT_MAP_MODEL) -> tuple[s
         return tuple(checkpoint.read_card(path, FORMAT)["towns"])
 
 
+def read_training_seed(name_or_path: str | Path) -> int | None:
+    """Read the seed of the training of detector weights; None where the card has none, and of registered detectors."""
+    if str(name_or_path) in _DETECTORS.names():
+        return None
+    with open_detector_file(name_or_path) as path:
+        seed = checkpoint.read_card(path).get("seed")
+    return seed if isinstance(seed, int) else None
+
+
 def load_map_model_state(name_or_path: str | Path = DEFAULT_MAP_MODEL) -> dict[str, Tensor]:
     """Read the tensors of a map model by name, to initialise training."""
     with _weights_file(name_or_path, list_map_models()) as path:

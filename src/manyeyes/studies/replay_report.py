@@ -111,15 +111,8 @@ def replay_and_report(drive: Excerpt, detector: BoxDetector, spec: ReportSpec, c
             if step.method in film.methods:
                 film.add(step.method, _draw_step(step, grid, _make_caption(step), min_scores[step.method], FILM_WIDTH))
             progress.advance(task)
-    comparison = summarize_comparison(
-        [
-            result
-            for name, accumulator in metrics.items()
-            for result in accumulator.compute_results(find_thresholds(detector, name))
-        ],
-        protocol,
-        spec.missing,
-    )
+    results = [r for name, tally in metrics.items() for r in tally.compute_results(find_thresholds(detector, name))]
+    comparison = summarize_comparison(results, protocol, spec.missing)
     print_comparison(console, comparison, spec.title)
     pose_chapters = _make_pose_chapters(pose_summaries)
     reliability = {name: accumulator.compute_reliability() for name, accumulator in metrics.items()}

@@ -54,7 +54,9 @@ class ApSummary:
 
 @dataclass(frozen=True)
 class MethodStats:
-    """Metrics of one method and class, without its frames. best_threshold: the score of greatest F on these data, for others."""
+    """Metrics of one method and class, without its frames. best_threshold: the score of greatest F on these data, for others.
+    resamples: AP on each resample of the scenarios, rounded, for each IoU threshold.
+    """
 
     method: str
     class_name: str
@@ -65,12 +67,14 @@ class MethodStats:
     perceive_ms: float
     operating_point: OperatingPoint | None
     best_threshold: float | None
+    resamples: tuple[tuple[float, ...], ...]
 
 
 @dataclass(frozen=True)
 class MethodComparison:
     """Comparison of methods. protocol: rules and range of AP. missing: missing files of the recording. operating_rows: methods at
-    their score thresholds. answer_rows: methods at the time of their answer.
+    their score thresholds. answer_rows: methods at the time of their answer. scenarios: in the order that resamples draw them.
+    training_seed: of the weights, where they state it.
     """
 
     protocol: DetectionProtocol
@@ -80,6 +84,8 @@ class MethodComparison:
     missing: MissingFiles = NONE_MISSING
     operating_rows: tuple[OperatingRow, ...] = ()
     answer_rows: tuple[AnswerRow, ...] = ()
+    scenarios: tuple[str, ...] = ()
+    training_seed: int | None = None
 
     @property
     def footer(self) -> str:
@@ -93,14 +99,21 @@ class MethodComparison:
 
 
 def summarize_comparison(
-    results: Sequence[MethodResult], protocol: DetectionProtocol, missing: MissingFiles = NONE_MISSING
+    results: Sequence[MethodResult],
+    protocol: DetectionProtocol,
+    missing: MissingFiles = NONE_MISSING,
+    training_seed: int | None = None,
 ) -> MethodComparison:
     """Summarize measured methods: rows, metrics and paired differences."""
+    frames = results[0].ap[0].frames if results else ()
+    scenarios = tuple(dict.fromkeys(frame.scenario for frame in frames))
     stats = tuple(map(_summarize_method, results))
     rows = tuple(make_row(result) for result in results)
     differences = compare_methods(results, protocol)
     operating_rows, answer_rows = make_operating_rows(results), make_answer_rows(results)
-    return MethodComparison(protocol, stats, rows, differences, missing, operating_rows, answer_rows)
+    return MethodComparison(
+        protocol, stats, rows, differences, missing, operating_rows, answer_rows, scenarios, training_seed
+    )
 
 
 def _summarize_method(result: MethodResult) -> MethodStats:
@@ -119,6 +132,7 @@ def _summarize_method(result: MethodResult) -> MethodStats:
         result.perceive_ms,
         result.operating_point,
         result.best_threshold,
+        tuple(tuple(round(value, 5) for value in row) for row in result.resamples),
     )
 
 

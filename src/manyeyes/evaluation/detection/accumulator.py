@@ -45,6 +45,7 @@ class MethodResult:
     operating_point: at the first of them. best_threshold: the score of greatest F there, for an evaluation of other data.
     answer_ap, answer_intervals: the same at the time of the answer, and answer_ms the mean time from sweep to answer; empty and NaN
     where that was not judged.
+    resamples: AP on each resample of the scenarios, for each IoU threshold.
     """
 
     method: str
@@ -61,6 +62,7 @@ class MethodResult:
     answer_ap: tuple[ApResult, ...] = ()
     answer_intervals: tuple[Interval, ...] = ()
     answer_ms: float = math.nan
+    resamples: tuple[tuple[float, ...], ...] = ()
 
     def paired_difference(self, other: MethodResult, iou: int, protocol: DetectionProtocol) -> Interval:
         """Return the AP of this method minus that of another, paired over scenarios. iou: index into IOU_THRESHOLDS."""
@@ -188,10 +190,11 @@ class MetricAccumulator:
             [[match for match in column if match.class_name == name] for column in columns]
             for columns in (matched, answers)
         )
+        samples = [bootstrap(m, protocol=protocol) for m in matches]
         return MethodResult(
             self.method,
             tuple(compute_ap(m, protocol) for m in matches),
-            tuple(bootstrap(m, protocol=protocol).interval() for m in matches),
+            tuple(s.interval() for s in samples),
             self.summarize_communication(),
             self.mean_age_ms(),
             _mean_ms(self.share_s),
@@ -203,6 +206,7 @@ class MetricAccumulator:
             tuple(compute_ap(m, protocol) for m in moved),
             tuple(bootstrap(m, protocol=protocol).interval() for m in moved),
             self.mean_answer_ms(),
+            tuple(tuple(s.samples.tolist()) for s in samples),
         )
 
 

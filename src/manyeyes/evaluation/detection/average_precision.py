@@ -61,6 +61,7 @@ from manyeyes.evaluation.detection.frame_match import (
     count_truth,
     rank_matches,
     sort_by_frame,
+    sum_groups,
 )
 from manyeyes.evaluation.detection.protocols import PROTOCOLS, DetectionProtocol, RangeMode, get_protocol
 from manyeyes.ops.box_iou import pairwise_iou, pairwise_iou_3d
@@ -305,7 +306,7 @@ def _compute_area(matches: Sequence[FrameMatch], n_gt: int, protocol: DetectionP
     if n_gt == 0:
         return math.nan
     ranked = rank_matches(matches, protocol, order)
-    gain = ranked.sum_groups(ranked.tp.astype(np.float64))
-    num_seen = np.cumsum(ranked.sum_groups(np.ones(len(ranked.tp))))
+    gain = sum_groups(ranked.tp.astype(np.float64), ranked.group_start)
+    num_seen = np.cumsum(sum_groups(np.ones(len(ranked.tp)), ranked.group_start))
     envelope = np.maximum.accumulate((np.cumsum(gain) / np.maximum(num_seen, 1))[::-1])[::-1]
     return float((gain * envelope)[1 if protocol.drop_first_segment else 0 :].sum() / n_gt)

@@ -75,11 +75,12 @@ class RankedMatches:
     frame: NDArray[np.int64]
     group_start: NDArray[np.int64]
 
-    def sum_groups(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the sums (..., K) of values (..., D) over each group."""
-        if len(self.group_start) == values.shape[-1]:
-            return values
-        return np.add.reduceat(values, self.group_start, axis=-1)
+
+def sum_groups(values: NDArray[np.float64], group_start: NDArray[np.int64] | None) -> NDArray[np.float64]:
+    """Return the sums (..., K) of values (..., D) over each group; group_start: (K,) where each begins, None: one value each."""
+    if group_start is None or len(group_start) == values.shape[-1]:
+        return values
+    return np.add.reduceat(values, group_start, axis=-1)
 
 
 def sort_by_frame(matches: Sequence[FrameMatch]) -> list[FrameMatch]:

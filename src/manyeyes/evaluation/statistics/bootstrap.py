@@ -23,10 +23,10 @@ import numpy as np
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.detection.frame_match import (
     FrameMatch,
-    RankedMatches,
     count_truth,
     rank_matches,
     sort_by_frame,
+    sum_groups,
 )
 from manyeyes.evaluation.detection.protocols import PROTOCOLS, DetectionProtocol
 from manyeyes.ops.keyed_random import keyed_uniform
@@ -52,19 +52,16 @@ class Interval:
 class PooledMatches:
     """Detections of many scenarios as one list in the protocol's order.
 
-    ranked: the list; scenario_row: (D,) row of names; n_gt: (S,) truth boxes of each scenario.
+    tp: (D,) bool; scenario_row: (D,) row of names; n_gt: (S,) truth boxes of each scenario. group_start: (K,) where each group of
+    detections begins that are one step; None: each is a step, in its place.
     """
 
     names: tuple[str, ...]
-    ranked: RankedMatches
+    tp: np.ndarray
     scenario_row: np.ndarray
     n_gt: np.ndarray
-    protocol: DetectionProtocol
-
-    @property
-    def tp(self) -> np.ndarray:
-        """(D,) bool."""
-        return self.ranked.tp
+    drop_first_segment: bool
+    group_start: np.ndarray | None = None
 
 
 Statistic = Callable[[PooledMatches, np.ndarray], np.ndarray]
@@ -79,14 +76,14 @@ def weighted_ap(pool: PooledMatches, weights: np.ndarray) -> np.ndarray:
     for begin in range(0, len(weights), step):
         rows = slice(begin, begin + step)
         drawn = weights[rows][:, pool.scenario_row].astype(np.float64)
-        weight, gain = pool.ranked.sum_groups(drawn), pool.ranked.sum_groups(drawn * pool.tp)
+        weight, gain = (sum_groups(values, pool.group_start) for values in (drawn, drawn * pool.tp))
         seen = np.cumsum(weight, 1)
         precision = np.cumsum(gain, 1) / np.maximum(seen, 1)
         envelope = np.maximum.accumulate(precision[:, ::-1], 1)[:, ::-1]
-        if pool.protocol.drop_first_segment:
+        if pool.drop_first_segment:
             is_first = (seen == weight) & (weight > 0)
             # Of several copies of the first detection only the first is left out, unless copies are one step.
-            gain -= np.where(is_first, gain if pool.protocol.ties == "together" else np.minimum(gain, 1), 0)
+            gain -= np.where(is_first, np.minimum(gain, 1) if pool.group_start is None else gain, 0)
         with np.errstate(invalid="ignore", divide="ignore"):
             ap[rows] = np.where(n_gt[rows] > 0, (gain * envelope).sum(1) / n_gt[rows], np.nan)
     return ap
@@ -173,7 +170,9 @@ def _pool_matches(matches: Sequence[FrameMatch], protocol: DetectionProtocol) ->
         n_gt[row[match.scenario]] += count_truth(match, protocol)
     ranked = rank_matches(matches, protocol, protocol.ap_order)
     frame_scenario = np.array([row[match.scenario] for match in matches], dtype=np.int64)
-    return PooledMatches(names, ranked, frame_scenario[ranked.frame], n_gt, protocol)
+    group_start = ranked.group_start if protocol.ties == "together" else None
+    scenario_row = frame_scenario[ranked.frame]
+    return PooledMatches(names, ranked.tp, scenario_row, n_gt, protocol.drop_first_segment, group_start)
 
 
 def exact_interval(value: float) -> Interval:

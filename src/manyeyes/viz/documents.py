@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of stored results in Markdown documents, between two markers.
+
+A marker is a comment on a line of its own, the table stands below it, and ``<!-- end of report -->`` ends it. Paths are below
+``benchmarks/results``:
+
+- ``<!-- report: FILE.json -->`` or ``<!-- report: FOLDER -->``: all tables of a file, or of all files of a folder by name, -
+``<!-- report: FILE.json TABLE ... -->``: some of its tables, by name (``methods``, ``operating-point``, ``differences``, ...),
+- ``<!-- report: seeds STRATEGY NAME=FILE.json,FILE.json NAME=... -->``: methods that were trained from several seeds;
+differences are
+  those of the first to the others.
+
+Below the tables of a file stands where its numbers come from.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from manyeyes.datatypes import ConfigError
+from manyeyes.viz.stored_tables import StoredTable, load_result, make_seed_tables, make_tables
+from manyeyes.viz.table import format_markdown_lines
+
+RESULTS = Path("benchmarks/results")
+END = "<!-- end of report -->"
+_BEGIN = re.compile(r"^<!-- report: (.+?) -->$", re.M)
+_FOLDERS = ("docs", "src", "examples", "benchmarks")
+
+
+@dataclass(frozen=True)
+class Document:
+    """A Markdown file with tables of stored results. text: as it is; updated: with the tables of its results."""
+
+    path: Path
+    text: str
+    updated: str
+
+
+def find_documents(root: Path) -> tuple[Document, ...]:
+    """Read all documents of a repository that have a marker, and make their tables.
+
+    Raises:
+        ConfigError: a marker or its results are not valid; the text names the document or the file of results.
+    """
+    paths = [*sorted(root.glob("*.md")), *(p for f in _FOLDERS for p in sorted((root / f).rglob("*.md")))]
+    texts = ((path, path.read_text(encoding="utf-8")) for path in paths)
+    return tuple(
+        Document(path, text, update_text(text, root / RESULTS, str(path.relative_to(root))))
+        for path, text in texts
+        if _BEGIN.search(text)
+    )
+
+
+def update_text(text: str, results: Path, name: str) -> str:
+    """Return the text with the tables of its markers made from the folder of results; name: of the document, for errors."""
+    parts, at = list[str](), 0
+    for marker in _BEGIN.finditer(text):
+        end = text.find(f"\n{END}", marker.end())
+        following = _BEGIN.search(text, marker.end())
+        if end < 0 or (following is not None and following.start() < end):
+            raise ConfigError(f"{name}: the marker {marker.group()} has no {END} below it; add one.")
+        words = marker.group(1).split()
+        parts += [text[at : marker.end()], "\n\n", "\n".join(_make_parts(words, results, name))]
+        at = end + 1
+    return "".join((*parts, text[at:]))
+
+
+def _make_parts(words: Sequence[str], results: Path, name: str) -> Iterator[str]:
+    """Yield the Markdown of one marker, by its words."""
+    if words[0] == "seeds":
+        yield from _make_seed_parts(words[1:], results, name)
+        return
+    path = results / words[0]
+    files = sorted(path.glob("*.json")) if path.is_dir() else [path]
+    if not files:
+        raise ConfigError(f"{name}: the folder {path} has no .json file of results.")
+    for file in files:
+        stored = load_result(file)
+        tables = make_tables(stored)
+        unknown = sorted(set(words[1:]) - {table.name for table in tables})
+        if unknown:
+            known = ", ".join(table.name for table in tables)
+            raise ConfigError(f"{name}: {file} has no table {unknown[0]}; it has {known}.")
+        chosen = [table for table in tables if table.name in words[1:]] or tables
+        yield from _format_tables(chosen, has_titles=len(chosen) > 1 or len(files) > 1 or path.is_dir())
+        yield f"{stored.origin}\n"
+
+
+def _make_seed_parts(words: Sequence[str], results: Path, name: str) -> Iterator[str]:
+    pairs = [word.partition("=") for word in words[1:]]
+    if not pairs or not all(method and files for method, _, files in pairs):
+        raise ConfigError(f"{name}: a marker of seeds is 'seeds STRATEGY NAME=FILE,FILE ...'; got {' '.join(words)}.")
+    runs = [(method, load_result(results / file)) for method, _, files in pairs for file in files.split(",")]
+    yield from _format_tables(make_seed_tables(runs, words[0]), has_titles=True)
+    yield from (f"- {method}: {stored.origin}" for method, stored in runs)
+    yield ""
+
+
+def _format_tables(tables: Sequence[StoredTable], has_titles: bool) -> Iterator[str]:
+    for table in tables:
+        yield (
+            f"**{table.title}**\n\n{format_markdown_lines(table.lines)}"
+            if has_titles
+            else format_markdown_lines(table.lines)
+        )

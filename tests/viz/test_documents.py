@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables of stored results in documents: made-up results, written and checked."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from manyeyes.cli.main import main
+from manyeyes.datatypes import ConfigError
+from manyeyes.viz.documents import END, find_documents, update_text
+from manyeyes.viz.stored_tables import load_result, make_tables
+
+ROOT = Path(__file__).resolve().parents[2]
+ORIGIN: dict[str, Any] = {
+    "command": "manyeyes evaluate --data D",
+    "git_commit": "0123456789abcdef",
+    "seed": 0,
+    "config": {"options": {"split": "val"}},
+}
+
+
+def interval(value: float | None, scenarios: int = 4) -> dict[str, Any]:
+    return {"value": value, "low": (value or 0) - 0.1, "high": (value or 0) + 0.1, "num_scenarios": scenarios}
+
+
+def sensors_row(recording: str, law: str, sweeps: int, value: float) -> dict[str, Any]:
+    pair = [interval(value, 1), interval(value, 1)]
+    return {"recording": recording, "law": law, "sweeps": sweeps, "tilt_deg": 0.0, "method": "intermediate", "ap": pair}
+
+
+def evaluation(classes: tuple[str, ...] = ("vehicle",)) -> dict[str, Any]:
+    names = ("precision", "recall", "f_score", "false_alarms_per_frame", "duplicates_per_object")
+    point = {
+        "threshold": {"score": 0.31, "source": "weights"},
+        **{name: interval(0.1 * k) for k, name in enumerate(names)},
+    }
+    row = {"ap50": interval(0.6), "ap70": interval(0.4), "bytes_per_message": 1234.4}
+    return {
+        "protocol": {"score_threshold": 0.05},
+        "stats": [],
+        "rows": [{"method": "late", "class_name": name, **row} for name in classes],
+        "operating_rows": [
+            {"method": "late", "class_name": name, "point": point, "legacy_ap": [interval(0.5), interval(0.3)]}
+            for name in classes
+        ],
+        "differences": [{"description": "late - none", "metric": "AP@0.5", "interval": interval(0.2)}],
+    }
+
+
+RESULTS: dict[str, Any] = {
+    "a-evaluate": {
+        "stats": [],
+        "rows": [
+            {"method": "none", "ap50": interval(0.5), "ap70": interval(None), "bytes_per_message": None},
+            {"method": "late", "ap50": interval(0.6), "ap70": interval(0.4), "bytes_per_message": 1234.4},
+        ],
+    },
+    "b-sensors": {
+        "study": "sensors",
+        "rows": [sensors_row(f"beams-{n}", law, s, 0.1 * s) for n in (16, 32) for law in ("zero", "carla") for s in (2, 1)],
+    },
+    "c-strata": {
+        "study": "strata",
+        "rows": [
+            {"stratum": "t", "method": "none", "num_scenarios": 3, "ap": [interval(0.5), interval(0.4)], "bytes_per_message": 0}
+        ],
+    },
+    "d-cases": {
+        "command": "python unseen_scenes.py",
+        "cases": [
+            {
+                "case": "argoverse2", "frames": 2, "vehicles": 18, "matched": 9, "under_crowns": 8, "matched_under_crowns": 1,
+                "false_boxes": 46,
+            }
+        ],
+    },
+}  # fmt: skip
+
+
+def write(path: Path, result: object, **origin: object) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"provenance": {**ORIGIN, **origin}, "result": result}))
+    return path
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A repository with one document and results of every kind."""
+    for name, result in RESULTS.items():
+        write(tmp_path / "benchmarks/results/all" / f"{name}.json", result)
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs/page.md").write_text(f"# Page\n\nText.\n\n<!-- report: all -->\n{END}\n\nAfter.\n")
+    return tmp_path
+
+
+def test_tables_are_written_once_between_their_markers(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = root / "docs/page.md"
+    assert main(["report", "docs", "--root", str(root), "--check"]) == 1
+    assert "docs/page.md: tables differ" in capsys.readouterr().err and END in page.read_text()
+    assert main(["report", "docs", "--root", str(root)]) == 0
+    text = re.sub(" +", " ", page.read_text())
+    assert text.startswith("# Page\n\nText.\n\n<!-- report: all -->\n\n**Methods**") and text.endswith(
+        f"{END}\n\nAfter.\n"
+    )
+    assert "| none | 0.500 [0.400, 0.600] | - | - |" in text and "| 0.400 [0.300, 0.500] | 1,234 |" in text
+    assert "| intensity | beams-16, 2 sweeps | beams-16, 1 sweep | beams-32, 2 sweeps | beams-32, 1 sweep |" in text
+    assert "| zero | 0.200 | 0.100 | 0.200 | 0.100 |" in text
+    assert "| argoverse2 | 2 | 18 | 9 | 46 | 1 of 8 |" in text
+    assert "`python unseen_scenes.py`, commit 0123456789ab, seed 0, split argoverse2." in text
+    assert "`manyeyes evaluate --data D`, commit 0123456789ab, seed 0, split val." in text
+    again = page.read_text()
+    assert main(["report", "docs", "--root", str(root)]) == 0 and page.read_text() == again
+    assert main(["report", "docs", "--root", str(root), "--check"]) == 0
+
+
+def test_a_changed_number_of_a_document_is_found(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = root / "docs/page.md"
+    main(["report", "docs", "--root", str(root)])
+    page.write_text(page.read_text().replace("0.600 [0.500, 0.700]", "0.700 [0.500, 0.700]"))
+    assert main(["report", "docs", "--root", str(root), "--check"]) == 1
+    assert "docs/page.md" in capsys.readouterr().err and "0.700 [0.500, 0.700]" in page.read_text()
+
+
+@pytest.mark.parametrize(
+    ("origin", "missing"),
+    [
+        ({"command": ""}, "command"),
+        ({"git_commit": None}, "git_commit"),
+        ({"seed": None}, "seed"),
+        ({"config": {"options": {"split": None}}}, "split"),
+        ({"config": None, "seed": None}, "seed, split"),
+    ],
+)
+def test_results_that_cannot_be_made_again_are_refused(
+    root: Path, origin: dict[str, Any], missing: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = root / "docs/page.md"
+    before = page.read_text()
+    write(root / "benchmarks/results/all/e.json", RESULTS["a-evaluate"], **origin)
+    for more in ([], ["--check"]):
+        assert main(["report", "docs", "--root", str(root), *more]) == 1
+        assert f"e.json: its provenance lacks {missing}, so" in capsys.readouterr().err
+    assert page.read_text() == before
+
+
+def test_several_seeds_and_uncommitted_changes_are_stated(tmp_path: Path) -> None:
+    path = write(tmp_path / "r.json", RESULTS["a-evaluate"], seeds=[1, 2], git_commit="0123456789abcdef+changes")
+    assert load_result(path).origin.endswith("commit 0123456789ab with changes, seeds 1, 2, split val.")
+
+
+def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"x\.json: no result of evaluate"):
+        make_tables(load_result(write(tmp_path / "x.json", {"cells": 1})))
+    (tmp_path / "y.json").write_text("[]")
+    for name in ("y.json", "missing.json"):
+        with pytest.raises(ConfigError, match=rf"{name}: no stored result"):
+            load_result(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("<!-- report: all -->\n", "page: the marker .* has no"),
+        (f"<!-- report: all -->\n<!-- report: all -->\n{END}\n", "page: the marker .* has no"),
+        (f"<!-- report: empty -->\n{END}\n", r"empty: no stored result"),
+        (f"<!-- report: all/a-evaluate.json other -->\n{END}\n", "has no table other; it has methods"),
+        (f"<!-- report: seeds late -->\n{END}\n", "page: a marker of seeds is"),
+    ],
+)
+def test_bad_markers_are_refused(root: Path, text: str, match: str) -> None:
+    with pytest.raises(ConfigError, match=match):
+        update_text(text, root / "benchmarks/results", "page")
+
+
+def test_one_table_of_a_file_is_chosen_by_its_name(root: Path) -> None:
+    write(root / "benchmarks/results/e.json", evaluation())
+    text = update_text(f"<!-- report: e.json operating-point -->\n{END}\n", root / "benchmarks/results", "page")
+    lines = re.sub(" +", " ", text).splitlines()
+    assert lines[2].startswith(
+        "| method | threshold | precision | recall | F | false alarms/frame | duplicates/object |"
+    )
+    assert lines[4].startswith("| late | 0.310 (weights) | 0.000 [-0.100, 0.100] | 0.100 [0.000, 0.200] |")
+    assert "late - none" not in text and "class" not in text
+
+
+def test_a_class_column_is_there_with_several_classes_only(tmp_path: Path) -> None:
+    for classes in (("vehicle",), ("vehicle", "pedestrian")):
+        tables = make_tables(load_result(write(tmp_path / "e.json", evaluation(classes))))
+        assert [table.name for table in tables] == ["methods", "operating-point", "differences"]
+        for table in tables[:2]:
+            assert ("class" in table.lines[0]) == (len(classes) > 1) and len(table.lines) == 1 + len(classes)
+
+
+def trained(seed: int, value: float) -> dict[str, Any]:
+    """An evaluation of one training: AP@0.5 of 41 resamples about the value, AP@0.7 half of it."""
+    resamples = [[scale * value + 0.005 * (k - 20) for k in range(41)] for scale in (1, 0.5)]
+    summaries = [{"ap": {"value": scale * value}} for scale in (1, 0.5)]
+    stats = {"method": "intermediate", "class_name": "vehicle", "ap_summaries": summaries, "resamples": resamples}
+    return {"stats": [stats], "rows": [], "training_seed": seed, "scenarios": ["a", "b"]}
+
+
+def test_seeds_of_methods_become_one_table(root: Path) -> None:
+    """AP@0.5: ours .80 .82 .84, theirs .79 .80 .81, pooled spread .0158: +.020 is not claimed; so at 0.7."""
+    values = {"ours": (0.80, 0.82, 0.84), "theirs": (0.79, 0.80, 0.81), "weak": (0.5, 0.5, 0.5)}
+    for name, column in values.items():
+        for seed, value in enumerate(column, 5):
+            write(root / f"benchmarks/results/{name}{seed}.json", trained(seed, value))
+    words = " ".join(f"{name}={','.join(f'{name}{s}.json' for s in (5, 6, 7))}" for name in values)
+    text = update_text(f"<!-- report: seeds intermediate {words} -->\n{END}\n", root / "benchmarks/results", "page")
+    text = re.sub(" +", " ", text)
+    assert "| ours | 5, 6, 7 | 0.820 [0.725, 0.915] | 0.020 | 0.410 [0.315, 0.505] | 0.010 |" in text
+    assert "| ours - theirs | AP@0.5 | +0.020 [+0.020, +0.020] | not claimed |" in text
+    assert "| ours - weak | AP@0.5 | +0.320 [+0.320, +0.320] | yes |" in text
+    assert "pooled over methods: AP@0.5 0.013, AP@0.7 0.006" in text
+    assert text.count("seed 0, split val.") == 9
+    write(root / "benchmarks/results/weak7.json", RESULTS["a-evaluate"])
+    with pytest.raises(ConfigError, match=r"weak7\.json: needs the method intermediate of class vehicle"):
+        update_text(f"<!-- report: seeds intermediate {words} -->\n{END}\n", root / "benchmarks/results", "page")
+
+
+@pytest.mark.slow
+def test_the_documents_of_this_repository_are_those_of_their_results() -> None:
+    documents = find_documents(ROOT)
+    assert {"README.md", "fine-tune.md", "costr-sensors.md"} <= {document.path.name for document in documents}
+    assert [str(document.path) for document in documents if document.text != document.updated] == []
