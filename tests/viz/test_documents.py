@@ -94,14 +94,14 @@ def root(tmp_path: Path) -> Path:
     for name, result in RESULTS.items():
         write(tmp_path / "benchmarks/results/all" / f"{name}.json", result)
     (tmp_path / "docs").mkdir()
-    (tmp_path / "docs/page.md").write_text(f"# Page\n\nText.\n\n<!-- report: all -->\n{END}\n\nAfter.\n")
+    (tmp_path / "docs" / "p.md").write_text(f"# Page\n\nText.\n\n<!-- report: all -->\n{END}\n\nAfter.\n")
     return tmp_path
 
 
 def test_tables_are_written_once_between_their_markers(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    page = root / "docs/page.md"
+    page = root / "docs" / "p.md"
     assert main(["report", "docs", "--root", str(root), "--check"]) == 1
-    assert "docs/page.md: tables differ" in capsys.readouterr().err and END in page.read_text()
+    assert "p.md: tables differ" in capsys.readouterr().err and END in page.read_text()
     assert main(["report", "docs", "--root", str(root)]) == 0
     text = re.sub(" +", " ", page.read_text())
     assert text.startswith("# Page\n\nText.\n\n<!-- report: all -->\n\n**Methods**") and text.endswith(
@@ -119,11 +119,11 @@ def test_tables_are_written_once_between_their_markers(root: Path, capsys: pytes
 
 
 def test_a_changed_number_of_a_document_is_found(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    page = root / "docs/page.md"
+    page = root / "docs" / "p.md"
     main(["report", "docs", "--root", str(root)])
     page.write_text(page.read_text().replace("0.600 [0.500, 0.700]", "0.700 [0.500, 0.700]"))
     assert main(["report", "docs", "--root", str(root), "--check"]) == 1
-    assert "docs/page.md" in capsys.readouterr().err and "0.700 [0.500, 0.700]" in page.read_text()
+    assert "p.md" in capsys.readouterr().err and "0.700 [0.500, 0.700]" in page.read_text()
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_a_changed_number_of_a_document_is_found(root: Path, capsys: pytest.Capt
 def test_results_that_cannot_be_made_again_are_refused(
     root: Path, origin: dict[str, Any], missing: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = root / "docs/page.md"
+    page = root / "docs" / "p.md"
     before = page.read_text()
     write(root / "benchmarks/results/all/e.json", RESULTS["a-evaluate"], **origin)
     for more in ([], ["--check"]):
