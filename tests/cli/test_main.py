@@ -42,7 +42,7 @@ def test_an_unknown_command_lists_the_known(capsys) -> None:
     assert capsys.readouterr().err == (
         "manyeyes: there is no command 'demmo'; did you mean demo? Known commands: "
         "demo, check, simulate, train, finetune, fit-codebook, calibrate, evaluate, replay, export, view, pose, map, keys, study, "
-        "doctor.\n"
+        "report, doctor.\n"
     )
 
 
