@@ -77,6 +77,8 @@ replay {{rec}} --frames -3 | --frames
 replay {{rec}} --frame -1 | --frame
 pose {{rec}} --min-score -0.1 | --min-score
 pose {{rec}} --frames two | --frames
+export {{rec}} --format waymo | --format
+export {{rec}} --min-score 2 | --min-score
 view {{rec}} --width 0 | --width
 view {{rec}} --width 1000000000 | --width
 view {{rec}} --half-extent-m 0 10 | --half-extent-m
@@ -190,6 +192,10 @@ evaluate --data {rec} --split test --pose-correction {missing}.safetensors | {mi
 evaluate --data {damaged} --split test --weights {weights} --workers 1 | vehicles
 replay {damaged} --split test --weights {weights} | vehicles
 replay {text} | {text}
+export {missing} | {missing}
+export {rec} --split test --scenario zz | zz
+export {rec} --split test --out {text} | {text}
+export {damaged} --split test --weights {weights} | vehicles
 view {missing} | {missing}
 view {rec} --split test --out {folder} | {folder}
 view {rec} --half-extent-m 0.1 10000 | --half-extent-m
