@@ -21,6 +21,7 @@ python benchmarks/step.py [--baseline COMMIT or FOLDER] [--drives 2] [--instants
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import sys
 import tempfile
@@ -435,10 +436,16 @@ def main() -> None:
             rows += compare(versions, case, drives, wanted.instants)
             for row in rows[-wanted.drives - 1 :]:
                 show(row)
-    if wanted.out:
-        settings = {"baseline": wanted.baseline, "drives": wanted.drives, "instants": wanted.instants, "threads": 1}
-        command = shlex.join(["python", *sys.argv])
-        write_json(wanted.out, {"command": command, "settings": settings, "rows": rows}, settings, seed=0)
+            if wanted.out:
+                save(rows, wanted)
+
+
+def save(rows: list[Row], wanted: argparse.Namespace) -> None:
+    """Write the rows so far; load: runnable processes per processor, on average over the last quarter of an hour."""
+    settings = {"baseline": wanted.baseline, "drives": wanted.drives, "instants": wanted.instants, "threads": 1}
+    command, load = shlex.join(["python", *sys.argv]), os.getloadavg()[2] / (os.cpu_count() or 1)
+    payload = {"command": command, "settings": settings, "load": round(load, 2), "rows": rows}
+    write_json(wanted.out, payload, settings, seed=0)
 
 
 if __name__ == "__main__":

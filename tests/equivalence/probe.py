@@ -8,6 +8,7 @@ of the package; ``compare.py`` maps those that changed. DATA: a folder in which 
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sys
 from collections.abc import Iterator
@@ -174,6 +175,8 @@ PROBES = (strategies, corrected_poses, fused_maps, trained_weights, studies)
 
 
 def main() -> None:
+    # Products of float32, whatever the processor.
+    os.environ["MANYEYES_BFLOAT16"] = "0"
     torch.set_num_threads(1)
     out, data = Path(sys.argv[1]), Path(sys.argv[2])
     data.mkdir(parents=True, exist_ok=True)
