@@ -15,6 +15,14 @@ def test_nearest_points_come_first_and_far_ones_not_at_all() -> None:
     assert nearest_rows(where, scene[:2], points, scene, 6, 5.0).tolist() == [[0, 2, 1, -1, -1, -1], [-1] * 6]
 
 
+def test_many_positions_are_worked_off_in_chunks() -> None:
+    g = torch.Generator().manual_seed(0)
+    where, points = 20 * torch.rand(1100, 2, generator=g), 20 * torch.rand(300, 2, generator=g)
+    found = nearest_rows(where, torch.zeros(1100), points, torch.zeros(300), 3, 100.0)
+    distance = torch.cdist(where, points)
+    assert torch.allclose(distance.gather(1, found), distance.sort(dim=1).values[:, :3])
+
+
 def test_points_of_other_scenes_are_not_found() -> None:
     points, where = torch.zeros(3, 2), torch.zeros(2, 2)
     found = nearest_rows(where, torch.tensor([0, 1]), points, torch.tensor([1, 0, 1]), 2, 1.0)

@@ -6,6 +6,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+_CHUNK = 512
+"""Positions whose distances are held at once."""
+
 
 def nearest_rows(
     xy: Tensor, batch: Tensor, points: Tensor, point_batch: Tensor, count: int, max_distance_m: float
@@ -17,9 +20,10 @@ def nearest_rows(
     """
     found = torch.full((len(xy), count), -1, dtype=torch.int64, device=xy.device)
     for scene in batch.unique().tolist():
-        here, there = (batch == scene).nonzero()[:, 0], (point_batch == scene).nonzero()[:, 0]
-        distance, order = torch.cdist(xy[here].detach(), points[there].detach()).sort(dim=1, stable=True)
-        distance, order = distance[:, :count], order[:, :count]
-        rows = torch.where(distance <= max_distance_m, there[order], -1)
-        found[here, : rows.shape[1]] = rows
+        there = (point_batch == scene).nonzero()[:, 0]
+        for here in (batch == scene).nonzero()[:, 0].split(_CHUNK):
+            distance, order = torch.cdist(xy[here].detach(), points[there].detach()).sort(dim=1, stable=True)
+            distance, order = distance[:, :count], order[:, :count]
+            rows = torch.where(distance <= max_distance_m, there[order], -1)
+            found[here, : rows.shape[1]] = rows
     return found
