@@ -353,12 +353,12 @@ def test_a_cloud_much_larger_than_the_egos_is_thinned_out(drive, detector, monke
     ego = Agent(detector, get_strategy("early"))
     frame = replace(some.frame(0, 2), points=some.frame(0, 2).points[:300])
     message = replace(make_header(some.frame(1, 2), detector.fingerprint), points=PointCloud.of(torch.rand(5000, 3)))
-    run_detector = ego.perception_cache.run_detector
+    run_detector = ego.perception_cache.merged.run_detector
 
     def count(cloud: PointCloud, before: PointCloud | None = None):
         sizes.append(len(cloud))
         return run_detector(cloud, before)
 
-    monkeypatch.setattr(ego.perception_cache, "run_detector", count)
+    monkeypatch.setattr(ego.perception_cache.merged, "run_detector", count)
     ego.perceive(frame, wire.encode(message))
     assert max(sizes) == 300 + 1000
