@@ -41,8 +41,8 @@ def test_an_unknown_command_lists_the_known(capsys) -> None:
     assert cli.main(["demmo"]) == 2
     assert capsys.readouterr().err == (
         "manyeyes: there is no command 'demmo'; did you mean demo? Known commands: "
-        "demo, check, simulate, train, finetune, fit-codebook, calibrate, evaluate, replay, export, view, pose, map, keys, study, "
-        "report, doctor.\n"
+        "demo, check, simulate, train, finetune, fit-codebook, calibrate, evaluate, replay, export, view, pose, map, live, keys, "
+        "study, report, doctor.\n"
     )
 
 
@@ -99,7 +99,18 @@ def test_doctor_prints_json_for_a_bug_report(capsys) -> None:
     import torch
 
     assert output["versions"]["torch"] == torch.__version__ and output["torch_threads"] == torch.get_num_threads()
-    assert {e["name"] for e in output["extras"]} == {"sim", "map", "view", "av2", "dask", "ray", "icp", "ros"}
+    assert {e["name"] for e in output["extras"]} == {
+        "sim",
+        "map",
+        "view",
+        "av2",
+        "dask",
+        "ray",
+        "icp",
+        "ros",
+        "train",
+        "live",
+    }
     assert {"cpu", "cores", "system", "git_commit", "weights", "towns", "towns_from", "package"} <= set(output)
 
 

@@ -19,7 +19,7 @@ class Options:
     """Who issues what."""
 
     stem: tyro.conf.Positional[Path]
-    """NAME.key and NAME.cert are written."""
+    """Stem of the files: NAME.key and NAME.cert are written."""
     issuer: Path = Path("keys/anchor.key")
     """The key that signs: that of an anchor, or of an issuer with its certificate beside it."""
     kind: Literal["agent", "issuer"] = "agent"
