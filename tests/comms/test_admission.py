@@ -18,7 +18,7 @@ import torch
 from manyeyes.comms import payloads
 from manyeyes.comms.drop_counts import AuthenticationRefusal, DropCounts
 from manyeyes.comms.inbox import Inbox
-from manyeyes.comms.network import UNKNOWN_ORIGIN, Origin
+from manyeyes.comms.network.interface import UNKNOWN_ORIGIN, Origin
 from manyeyes.comms.receiver_limits import ReceiverLimits
 from manyeyes.comms.token_format import TokenFormat
 from manyeyes.comms.wire import HEADER_BYTES, EncodedBody, encode, make_packets

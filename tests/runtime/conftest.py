@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import pytest
 from tests.agents.conftest import detector, drive  # noqa: F401
 
-from manyeyes.comms.certificate import RIGHTS, SENDER_RIGHTS, Right
+from manyeyes.comms.signatures.certificate import RIGHTS, SENDER_RIGHTS, Right
 
 pytest.importorskip("cryptography", reason="the extra live is not installed")
 

@@ -9,10 +9,10 @@ import pytest
 import torch
 from tests.runtime.conftest import START_S, Federation
 
-from manyeyes.comms.certificate import SENDER_RIGHTS, Area, make_identifier
-from manyeyes.comms.envelope import SIGNED, SIGNED_WITH_CERTIFICATE
 from manyeyes.comms.inbox import Inbox
-from manyeyes.comms.network import Origin
+from manyeyes.comms.network.interface import Origin
+from manyeyes.comms.signatures.certificate import SENDER_RIGHTS, Area, make_identifier
+from manyeyes.comms.signatures.envelope import SIGNED, SIGNED_WITH_CERTIFICATE
 from manyeyes.comms.wire import encode
 from manyeyes.datatypes import Boxes, Message, Transform
 from manyeyes.runtime.authentication import MAX_UNSIGNED, MAX_VERIFICATIONS, REPLAY_STAMPS, PacketVerifier
@@ -192,7 +192,7 @@ def test_an_issuer_comes_from_the_trust_file_only_and_grants_no_more_than_it_has
     key = generate_key()
     unknown = Identity(key, stranger.issue(public_bytes(key), SENDER_RIGHTS, 1, Validity(START_S)))
     assert "certificate" in refusals(receive(federation.trust, signed(unknown, make_message())))
-    # The holder of an agent's certificate signs one for somebody else.
+    # The holder of an agent's certificate signs one for another agent.
     agent = federation.identity(1)
     below = Issuer(agent.key, agent.certificate.identifier)
     third = Identity(key, below.issue(public_bytes(key), SENDER_RIGHTS, 2, Validity(START_S)))

@@ -16,9 +16,9 @@ from manyeyes import Agent, AgentFrame
 from manyeyes.agents.agent import Perception
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.registry import get_strategy
-from manyeyes.comms.certificate import SENDER_RIGHTS, Certificate
-from manyeyes.comms.envelope import join_signed, split_signed
-from manyeyes.comms.network import Origin
+from manyeyes.comms.network.interface import Origin
+from manyeyes.comms.signatures.certificate import SENDER_RIGHTS, Certificate
+from manyeyes.comms.signatures.envelope import join_signed, split_signed
 from manyeyes.comms.wire import encode
 from manyeyes.datatypes import Boxes, Message, Transform
 from manyeyes.runtime.authentication import PacketVerifier
@@ -70,7 +70,7 @@ ATTACKS: dict[str, Attack] = {
 
 
 def disguise(packets: list[bytes], signed: bytes, outsider: Identity) -> list[bytes]:
-    """Unsigned; with the envelope of the victim, with and without its certificate; and with a certificate of nobody's."""
+    """Unsigned; with the envelope of the victim, with and without its certificate; and with a certificate of no known issuer."""
     victim = split_signed(signed)
     ticket, wrong = outsider.certificate.pack(), lambda _: victim.signature
     stolen = [join_signed(victim.signer, c, p, wrong) for p in packets for c in (victim.certificate, None)]

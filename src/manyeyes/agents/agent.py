@@ -39,9 +39,9 @@ from manyeyes.agents.token_codec import (
 from manyeyes.comms import wire
 from manyeyes.comms.admission import Authenticator
 from manyeyes.comms.agent_body import count_agent_body_bytes
-from manyeyes.comms.envelope import UNSIGNED, EnvelopeSize
 from manyeyes.comms.inbox import Inbox, ReceivedMessage, Rejection
 from manyeyes.comms.receiver_limits import ReceiverLimits
+from manyeyes.comms.signatures.envelope import UNSIGNED, EnvelopeSize
 from manyeyes.comms.token_selection import SelectedTokens, select_for_packets
 from manyeyes.comms.wire import TokenEncoding
 from manyeyes.datatypes import AgentFrame, Boxes, Message, SparseBev

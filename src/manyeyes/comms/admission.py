@@ -15,12 +15,12 @@ import numpy as np
 from manyeyes.comms import payloads
 from manyeyes.comms.drop_counts import AuthenticationRefusal, DropReason
 from manyeyes.comms.entropy import CodeTables
-from manyeyes.comms.envelope import SignedPacket, is_signed, split_signed
 from manyeyes.comms.map_payload import UNIT_M, ElementRows
-from manyeyes.comms.network import UNKNOWN_ORIGIN, Origin
+from manyeyes.comms.network.interface import UNKNOWN_ORIGIN, Origin
+from manyeyes.comms.network.tiles import NetworkTile
 from manyeyes.comms.payloads import ObjectRows, TokenRows
 from manyeyes.comms.receiver_limits import ReceiverLimits
-from manyeyes.comms.tiles import Tile
+from manyeyes.comms.signatures.envelope import SignedPacket, is_signed, split_signed
 from manyeyes.comms.token_format import TokenFormat
 from manyeyes.comms.wire import Envelope, Fragment, open_packet, read_fragment
 from manyeyes.datatypes import BevGrid
@@ -99,7 +99,7 @@ class Admission:
         if not origin.tile:
             return None
         x, y = envelope.header.pose[:2]
-        return None if Tile.of_name(origin.tile).is_next_to(Tile.at(x, y)) else "tile"
+        return None if NetworkTile.of_name(origin.tile).is_next_to(NetworkTile.at(x, y)) else "tile"
 
     def _check_claims(self, envelope: Envelope) -> DropReason | None:
         """Numbers that the reader of the body would allocate for."""

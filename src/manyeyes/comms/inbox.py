@@ -10,7 +10,7 @@ from typing import Literal
 from manyeyes.comms.admission import Admission, Authenticator
 from manyeyes.comms.drop_counts import DropCounts, DropReason
 from manyeyes.comms.entropy import CodeTables
-from manyeyes.comms.network import UNKNOWN_ORIGIN, Origin
+from manyeyes.comms.network.interface import UNKNOWN_ORIGIN, Origin
 from manyeyes.comms.primitives import PacketError
 from manyeyes.comms.receiver_limits import ReceiverLimits
 from manyeyes.comms.sender_table import SenderTable

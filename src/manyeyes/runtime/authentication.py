@@ -14,10 +14,10 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 from manyeyes.comms import payloads
-from manyeyes.comms.certificate import Certificate, Right
 from manyeyes.comms.drop_counts import AuthenticationRefusal
-from manyeyes.comms.envelope import SignedPacket
-from manyeyes.comms.network import Origin
+from manyeyes.comms.network.interface import Origin
+from manyeyes.comms.signatures.certificate import Certificate, Right
+from manyeyes.comms.signatures.envelope import SignedPacket
 from manyeyes.comms.wire import Envelope
 from manyeyes.datatypes import WireError
 from manyeyes.runtime.keys import is_signature, read_public_key

@@ -15,8 +15,8 @@ from manyeyes.agents.agent import Agent, Perception
 from manyeyes.agents.strategies.no_fusion import NoFusion
 from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.comms.drop_counts import DropCounts
-from manyeyes.comms.envelope import UNSIGNED, EnvelopeSize
-from manyeyes.comms.network import ReceivedPacket
+from manyeyes.comms.network.interface import ReceivedPacket
+from manyeyes.comms.signatures.envelope import UNSIGNED, EnvelopeSize
 from manyeyes.datatypes import AgentFrame
 from manyeyes.runtime.authentication import PacketVerifier
 

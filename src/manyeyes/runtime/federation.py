@@ -9,7 +9,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from manyeyes.comms.certificate import RIGHTS, SENDER_RIGHTS, Certificate, Right
+from manyeyes.comms.signatures.certificate import RIGHTS, SENDER_RIGHTS, Certificate, Right
 from manyeyes.datatypes import ConfigError
 from manyeyes.runtime.keys import (
     CERTIFICATE_SUFFIX,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from manyeyes._io import atomic_replace, atomic_write, read_file
-from manyeyes.comms.certificate import (
+from manyeyes.comms.signatures.certificate import (
     CERTIFICATE_BYTES,
     Area,
     Certificate,
@@ -166,7 +166,7 @@ class Identity:
 
     @property
     def agent_id(self) -> int:
-        """The pseudonym."""
+        """The pseudonym, from the certificate."""
         return self.certificate.agent_id
 
     def save(self, stem: Path, passphrase: bytes | None = None) -> None:

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field, replace
 
 from manyeyes.agents.agent import Agent, Perception
 from manyeyes.comms.drop_counts import DropCounts
-from manyeyes.comms.envelope import UNSIGNED
-from manyeyes.comms.network import Network
+from manyeyes.comms.network.interface import Network
+from manyeyes.comms.signatures.envelope import UNSIGNED
 from manyeyes.datatypes import AgentFrame, ConfigError
 from manyeyes.runtime.clock import LiveClock
 from manyeyes.runtime.engine import Engine, digest_packets, digest_perception

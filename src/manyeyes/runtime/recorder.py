@@ -27,8 +27,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 
 from manyeyes._io import atomic_replace
-from manyeyes.comms.envelope import EnvelopeSize
-from manyeyes.comms.network import Origin, ReceivedPacket
+from manyeyes.comms.network.interface import Origin, ReceivedPacket
+from manyeyes.comms.signatures.envelope import EnvelopeSize
 from manyeyes.datatypes import AgentFrame, PointCloud, RecordingError, Transform
 from manyeyes.datatypes.body import AgentBody
 from manyeyes.datatypes.extras import import_extra

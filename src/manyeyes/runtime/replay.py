@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from manyeyes.agents.agent import Agent, Perception
-from manyeyes.comms.network import ReceivedPacket
+from manyeyes.comms.network.interface import ReceivedPacket
 from manyeyes.datatypes import AgentFrame, RecordingError
 from manyeyes.runtime.authentication import PacketVerifier, SecurityMode
 from manyeyes.runtime.engine import Engine, digest_packets, digest_perception

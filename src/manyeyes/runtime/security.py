@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Security of a live agent: who it is, whom it accepts, and a trust file that is read again when it changes."""
+"""Security of a live agent: its identity, the senders that it accepts, and a trust file that is read again when it changes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class TrustWatcher:
         self.error: str | None = None
 
     def poll(self, now_ns: int) -> Trust | None:
-        """Return the new trust file, if there is one; looks at the disk twice a second."""
+        """Return the new trust file, if there is one; the disk is read twice a second."""
         if now_ns < self._next_ns:
             return None
         self._next_ns = now_ns + CHECK_PERIOD_NS

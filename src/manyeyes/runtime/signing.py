@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from manyeyes.comms.envelope import SIGNED, SIGNED_WITH_CERTIFICATE, EnvelopeSize, join_signed
+from manyeyes.comms.signatures.envelope import SIGNED, SIGNED_WITH_CERTIFICATE, EnvelopeSize, join_signed
 from manyeyes.runtime.keys import Identity
 
 CERTIFICATE_PERIOD_NS = 1_000_000_000

@@ -69,7 +69,7 @@ class RunStatistics:
     _sent: tuple[int, int] = (0, 0)
 
     def add(self, tick: LiveTick) -> None:
-        """Count one tick."""
+        """Count one tick of the run."""
         values = (tick.ages_ns, (tick.latency_ns,), (tick.share_ns,), (tick.wait_ns,), (tick.perceive_ns,))
         for column, new in zip(self._columns.values(), values):
             column += new

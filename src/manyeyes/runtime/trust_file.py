@@ -7,7 +7,7 @@ name = "demo"
 key = "<64 hexadecimal digits>"
 rights = ["objects", "tokens", "points", "map", "infrastructure", "issuer"]
 until = 2026-12-31T00:00:00Z
-# area = [0, -2, 4, 4]        first square i, j of comms.tiles, and their numbers; without it: anywhere
+# area = [0, -2, 4, 4]        first square i, j of comms.network.tiles, and their numbers; without it: anywhere
 
 [[issuer]]
 name = "issuer"
@@ -31,7 +31,15 @@ from pathlib import Path
 from typing import Any
 
 from manyeyes._io import atomic_write_text, read_file
-from manyeyes.comms.certificate import IDENTIFIER_BYTES, KEY_BYTES, RIGHTS, Area, Certificate, Right, make_identifier
+from manyeyes.comms.signatures.certificate import (
+    IDENTIFIER_BYTES,
+    KEY_BYTES,
+    RIGHTS,
+    Area,
+    Certificate,
+    Right,
+    make_identifier,
+)
 from manyeyes.datatypes import ManyeyesError, WireError
 from manyeyes.datatypes.errors import shorten
 from manyeyes.runtime.keys import is_signature, read_public_key

@@ -12,8 +12,8 @@ import pytest
 
 from manyeyes.comms.channel import Channel, channel_preset
 from manyeyes.comms.local_bus import LocalBus
-from manyeyes.comms.network import Network, ReceivedPacket
-from manyeyes.comms.tiles import TILE_M
+from manyeyes.comms.network.interface import Network, ReceivedPacket
+from manyeyes.comms.network.tiles import TILE_M
 from manyeyes.datatypes import ConfigError
 from manyeyes.runtime.transports.local import LocalNetwork
 from manyeyes.runtime.transports.udp import UdpConfig, UdpNetwork

@@ -16,7 +16,7 @@ RightOption = Literal["objects", "tokens", "points", "map", "infrastructure"]
 
 @dataclass(frozen=True)
 class Options:
-    """Who issues what."""
+    """The issuer, and the certificate that it issues."""
 
     stem: tyro.conf.Positional[Path]
     """Stem of the files: NAME.key and NAME.cert are written."""

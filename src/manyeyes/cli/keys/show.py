@@ -11,14 +11,14 @@ import tyro
 
 @dataclass(frozen=True)
 class Options:
-    """Which certificate."""
+    """The certificate that is printed."""
 
     certificate: tyro.conf.Positional[Path]
     """A .cert file."""
 
 
 def main(options: Options) -> None:
-    """Print the fields."""
+    """Print the fields of the certificate."""
     from datetime import UTC, datetime
 
     from manyeyes.runtime.keys import load_certificate

@@ -11,14 +11,14 @@ import tyro
 
 @dataclass(frozen=True)
 class Options:
-    """Which trust file."""
+    """The trust file that is printed."""
 
     trust: tyro.conf.Positional[Path]
     """A trust.toml of 'manyeyes keys anchor'."""
 
 
 def main(options: Options) -> None:
-    """Print the content."""
+    """Print the content of the file."""
     from manyeyes.runtime.trust_file import Trust
 
     trust = Trust.load(options.trust)

@@ -23,7 +23,7 @@ def main(options: Options) -> None:
     """Verify the certificate.
 
     Raises:
-        KeyFileError: the trust file does not admit it; the text says why.
+        KeyFileError: the trust file does not admit it; the text gives the reason.
     """
     import time
 

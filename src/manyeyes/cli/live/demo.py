@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import select
+import signal
 import socket
 import subprocess
 import sys
@@ -60,7 +61,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Run the team."""
+    """Run the team, and print its table."""
     from rich.console import Console
 
     from manyeyes._lock import hold_folder
@@ -150,7 +151,7 @@ class _FreePort:
 
     @property
     def number(self) -> int:
-        """The port."""
+        """The port, chosen at first use."""
         if not self._number:
             with socket.socket() as probe:
                 probe.bind(("127.0.0.1", 0))
@@ -165,6 +166,8 @@ def _run_processes(commands: Sequence[Sequence[str]], options: Options, console:
     """Start the processes together, and wait for their end; return the rate of their clock."""
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    # The end of this process ends those of the agents, too.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     processes = [subprocess.Popen(command, env=environment, **pipes) for command in commands]
     try:
         with console.status("Starting the agents"):

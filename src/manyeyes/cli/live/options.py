@@ -12,7 +12,7 @@ from manyeyes._bounds import ByteCount, InputPath, PortNumber
 
 if TYPE_CHECKING:
     from manyeyes.agents.agent import Agent
-    from manyeyes.comms.network import Network
+    from manyeyes.comms.network.interface import Network
     from manyeyes.runtime.recorder import RunConfig
     from manyeyes.runtime.security import Security
 
@@ -28,7 +28,7 @@ class NetworkOptions:
     listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
     """zenoh: endpoints on which others connect, such as tcp/0.0.0.0:7447; port 0 is any."""
     connect: tuple[str, ...] = ()
-    """zenoh: endpoints of other agents; one is enough, it tells of the others."""
+    """zenoh: endpoints of other agents; one is enough, since it reports the others."""
     scouting: bool = False
     """zenoh: find other agents by multicast, too."""
     zenoh_config: InputPath | None = None
@@ -39,7 +39,7 @@ class NetworkOptions:
     """udp: the port of all agents of a network."""
 
     def open(self, agent_id: int, clock: Callable[[], int]) -> Network:
-        """Join the network."""
+        """Join the network as an agent."""
         if self.transport == "udp":
             from manyeyes.runtime.transports.udp import UdpConfig, UdpNetwork
 
@@ -53,7 +53,7 @@ class NetworkOptions:
 
 @dataclass(frozen=True)
 class SecurityOptions:
-    """Signatures."""
+    """Keys, trust file and mode of signatures."""
 
     security: Literal["off", "warn", "require"] = "off"
     """off: nothing is signed. warn: unsigned packets are accepted from a few senders. require: they are refused."""

@@ -15,7 +15,7 @@ import tyro
 
 @dataclass(frozen=True)
 class Options:
-    """Which run."""
+    """The recorded run, and how it is computed."""
 
     run: tyro.conf.Positional[Path]
     """A recording of 'manyeyes live run --record'."""

@@ -17,6 +17,7 @@ import tyro
 
 from manyeyes._bounds import AgentId, DurationMs, OutputFile, PlaybackRate, PositiveInt, WorkerCount
 from manyeyes.cli.live.options import MethodOptions, NetworkOptions, SecurityOptions
+from manyeyes.datatypes.errors import ConfigError
 
 if TYPE_CHECKING:
     from manyeyes.agents.agent import Agent
@@ -118,7 +119,10 @@ def _wait_for_start(options: Options, agent: Agent, first: AgentFrame) -> LiveCl
         return LiveClock(time.time_ns() + START_DELAY_NS, options.rate)
     sys.stdout.write(f"{READY} {took:.4f}\n")
     sys.stdout.flush()
-    start_ns, rate = sys.stdin.readline().split()
+    words = sys.stdin.readline().split()
+    if len(words) != 2:
+        raise ConfigError("--await-start reads the time of the start and the rate from the input; the input ended.")
+    start_ns, rate = words
     return LiveClock(int(start_ns), float(rate))
 
 

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Networks (``comms.network.Network``): in one process, UDP multicast, zenoh."""
+"""Networks (``comms.network.interface.Network``): in one process, UDP multicast, zenoh."""

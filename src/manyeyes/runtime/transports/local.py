@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from manyeyes.comms.local_bus import LocalBus
-from manyeyes.comms.network import Origin, ReceivedPacket
+from manyeyes.comms.network.interface import Origin, ReceivedPacket
 
 NEIGHBOUR_SILENCE_NS = 1_000_000_000
 

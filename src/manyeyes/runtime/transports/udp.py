@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Network by UDP multicast: one datagram a packet, to all agents around; nearest to a broadcast radio.
 
-Each tile (``comms.tiles``) of each network has a group in 239.0.0.0/8 by a hash of both names; agents join the groups of their tile
-and of the eight around it. A datagram is ``MU``, 8 bytes of that hash, the indices i, j of the tile (2 x i32, little-endian), and
-the packet: the groups of two tiles may coincide, their hashes do not.
+Each tile (``comms.network.tiles``) of each network has a group in 239.0.0.0/8 by a hash of both names; agents join the groups of
+their tile and of the eight around it. A datagram is ``MU``, 8 bytes of that hash, the indices i, j of the tile (2 x i32,
+little-endian), and the packet: the groups of two tiles may coincide, their hashes do not.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from manyeyes.comms.link_rings import LinkRings
-from manyeyes.comms.network import Origin, ReceivedPacket
-from manyeyes.comms.tiles import Tile
+from manyeyes.comms.network.interface import Origin, ReceivedPacket
+from manyeyes.comms.network.link_rings import LinkRings
+from manyeyes.comms.network.tiles import NetworkTile
 from manyeyes.datatypes import ConfigError
 
 DEFAULT_PORT = 17_448
@@ -51,7 +51,7 @@ class UdpNetwork:
 
     def __init__(self, config: UdpConfig, clock: Callable[[], int]) -> None:
         self._config, self._rings = config, LinkRings(clock)
-        self._tile: Tile | None = None
+        self._tile: NetworkTile | None = None
         self._joined: dict[str, int] = {}
         self._address = socket.inet_aton(config.interface)
         try:
@@ -112,9 +112,9 @@ class UdpNetwork:
         self._receiver.close()
         self._sender.close()
 
-    def _move(self, position_xy: tuple[float, float]) -> Tile:
+    def _move(self, position_xy: tuple[float, float]) -> NetworkTile:
         """Join the groups of the tiles around a position, and leave others."""
-        tile = Tile.at(*position_xy) if self._tile is None else self._tile.move_to(*position_xy)
+        tile = NetworkTile.at(*position_xy) if self._tile is None else self._tile.move_to(*position_xy)
         if tile != self._tile:
             self._tile = tile
             wanted = {self._group(other) for other in tile.with_neighbours()}
@@ -148,13 +148,13 @@ class UdpNetwork:
         if len(data) < _HEADER.size or tile is None or (port == self._own_port and host == self._config.interface):
             return
         magic, scope, i, j = _HEADER.unpack_from(data)
-        sent_in = Tile(i, j)
+        sent_in = NetworkTile(i, j)
         if magic == _MAGIC and sent_in.is_next_to(tile) and scope == self._scope(sent_in):
             self._rings.put(data[_HEADER.size :], Origin(f"{host}:{port}", sent_in.name))
 
-    def _scope(self, tile: Tile) -> bytes:
+    def _scope(self, tile: NetworkTile) -> bytes:
         return hashlib.sha256(f"manyeyes/{self._config.network}/3/{tile.name}".encode()).digest()[:8]
 
-    def _group(self, tile: Tile) -> str:
+    def _group(self, tile: NetworkTile) -> str:
         scope = self._scope(tile)
         return f"239.{scope[0]}.{scope[1]}.{scope[2]}"

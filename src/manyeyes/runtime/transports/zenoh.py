@@ -14,9 +14,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from manyeyes.comms.link_rings import MAX_PACKET_BYTES, LinkRings
-from manyeyes.comms.network import Origin, ReceivedPacket
-from manyeyes.comms.tiles import Tile
+from manyeyes.comms.network.interface import Origin, ReceivedPacket
+from manyeyes.comms.network.link_rings import MAX_PACKET_BYTES, LinkRings
+from manyeyes.comms.network.tiles import NetworkTile
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.extras import import_extra
 
@@ -54,8 +54,8 @@ class ZenohNetwork:
         self._zenoh = import_extra("zenoh", "live", "The network zenoh")
         self._prefix, self._agent_id = f"manyeyes/{config.network}/3", agent_id
         self._rings = LinkRings(clock)
-        self._tile: Tile | None = None
-        self._subscriptions: dict[Tile, Any] = {}
+        self._tile: NetworkTile | None = None
+        self._subscriptions: dict[NetworkTile, Any] = {}
         self._publisher: Any = None
         try:
             self._session = self._zenoh.open(self._make_config(config))
@@ -122,7 +122,7 @@ class ZenohNetwork:
 
     def _move(self, position_xy: tuple[float, float]) -> None:
         """Subscribe to the tiles around a position, and publish in its own."""
-        tile = Tile.at(*position_xy) if self._tile is None else self._tile.move_to(*position_xy)
+        tile = NetworkTile.at(*position_xy) if self._tile is None else self._tile.move_to(*position_xy)
         if tile == self._tile:
             return
         self._tile, wanted = tile, tile.with_neighbours()

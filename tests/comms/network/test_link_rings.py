@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
-from manyeyes.comms.link_rings import MAX_PACKET_BYTES, NEIGHBOUR_SILENCE_NS, LinkRings
-from manyeyes.comms.network import Origin
+from manyeyes.comms.network.interface import Origin
+from manyeyes.comms.network.link_rings import MAX_PACKET_BYTES, NEIGHBOUR_SILENCE_NS, LinkRings
 
 
 class Clock:

@@ -9,10 +9,10 @@ import struct
 import pytest
 from hypothesis import given, strategies as st
 
-from manyeyes.comms.certificate import CERTIFICATE_BYTES, RIGHTS, Area, Certificate
-from manyeyes.comms.envelope import CONTEXT, ENVELOPE_BYTES, join_signed, split_signed
+from manyeyes.comms.network.tiles import NetworkTile
 from manyeyes.comms.primitives import PacketError
-from manyeyes.comms.tiles import Tile
+from manyeyes.comms.signatures.certificate import CERTIFICATE_BYTES, RIGHTS, Area, Certificate
+from manyeyes.comms.signatures.envelope import CONTEXT, ENVELOPE_BYTES, join_signed, split_signed
 from manyeyes.datatypes import ConfigError, WireError
 
 SIGNER, PACKET, TICKET = b"signer-1", b"ME packet", bytes(range(126))
@@ -114,9 +114,9 @@ def test_an_area_contains_its_squares() -> None:
 
 
 def test_tiles_have_names_neighbours_and_hysteresis() -> None:
-    here = Tile.at(-0.1, 500.0)
-    assert here == Tile(-1, 1) and Tile.of_name(here.name) == here and len(here.with_neighbours()) == 9
-    assert here.is_next_to(Tile(0, 2)) and not here.is_next_to(Tile(1, 1))
-    assert here.move_to(49.0, 700.0) == here and here.move_to(51.0, 700.0) == Tile(0, 1)
+    here = NetworkTile.at(-0.1, 500.0)
+    assert here == NetworkTile(-1, 1) and NetworkTile.of_name(here.name) == here and len(here.with_neighbours()) == 9
+    assert here.is_next_to(NetworkTile(0, 2)) and not here.is_next_to(NetworkTile(1, 1))
+    assert here.move_to(49.0, 700.0) == here and here.move_to(51.0, 700.0) == NetworkTile(0, 1)
     with pytest.raises(ConfigError, match="g0_-3"):
-        Tile.of_name("u33dc0")
+        NetworkTile.of_name("u33dc0")

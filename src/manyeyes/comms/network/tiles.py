@@ -16,19 +16,19 @@ HYSTERESIS_M = 50.0
 _NAME = re.compile(r"g(-?\d{1,6})_(-?\d{1,6})")
 
 
-class Tile(NamedTuple):
+class NetworkTile(NamedTuple):
     """The square from (i, j) to (i + 1, j + 1), times TILE_M, in the world frame."""
 
     i: int
     j: int
 
     @classmethod
-    def at(cls, x: float, y: float) -> Tile:
+    def at(cls, x: float, y: float) -> NetworkTile:
         """Return the tile of a position, metres."""
         return cls(math.floor(x / TILE_M), math.floor(y / TILE_M))
 
     @classmethod
-    def of_name(cls, name: str) -> Tile:
+    def of_name(cls, name: str) -> NetworkTile:
         """Return the tile of a name.
 
         Raises:
@@ -44,15 +44,15 @@ class Tile(NamedTuple):
         """The name in keys of a network."""
         return f"g{self.i}_{self.j}"
 
-    def with_neighbours(self) -> frozenset[Tile]:
+    def with_neighbours(self) -> frozenset[NetworkTile]:
         """Return the tile and the eight around it."""
-        return frozenset(Tile(self.i + di, self.j + dj) for di in (-1, 0, 1) for dj in (-1, 0, 1))
+        return frozenset(NetworkTile(self.i + di, self.j + dj) for di in (-1, 0, 1) for dj in (-1, 0, 1))
 
-    def is_next_to(self, other: Tile) -> bool:
+    def is_next_to(self, other: NetworkTile) -> bool:
         """Return whether another tile is this one or one of the eight around it."""
         return max(abs(self.i - other.i), abs(self.j - other.j)) <= 1
 
-    def move_to(self, x: float, y: float) -> Tile:
+    def move_to(self, x: float, y: float) -> NetworkTile:
         """Return the tile of an agent that was in this one: another one only beyond HYSTERESIS_M."""
         outside = max(self.i * TILE_M - x, x - (self.i + 1) * TILE_M, self.j * TILE_M - y, y - (self.j + 1) * TILE_M)
-        return Tile.at(x, y) if outside > HYSTERESIS_M else self
+        return NetworkTile.at(x, y) if outside > HYSTERESIS_M else self

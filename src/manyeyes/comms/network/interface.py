@@ -45,5 +45,5 @@ class Network(Protocol):
         ...
 
     def close(self) -> None:
-        """Leave the network."""
+        """Leave the network for good."""
         ...

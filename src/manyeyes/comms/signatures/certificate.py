@@ -7,7 +7,7 @@ All numbers are little-endian:
 offset bytes type     meaning
 ====== ===== ======== =====================================================================================
 0      1     u8       version, 1
-1      1     u8       suite, as in ``comms.envelope``
+1      1     u8       suite, as in ``comms.signatures.envelope``
 2      2     u16      rights, one bit each, in the order of ``RIGHTS``
 4      4     i32      agent id, the pseudonym; 0 of an issuer
 8      4     u32      start of validity, seconds since 1970
@@ -28,7 +28,7 @@ import struct
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-from manyeyes.comms.tiles import TILE_M, Tile
+from manyeyes.comms.network.tiles import TILE_M, NetworkTile
 from manyeyes.datatypes import WireError
 
 Right = Literal["objects", "tokens", "points", "map", "infrastructure", "issuer"]
@@ -50,7 +50,7 @@ def make_identifier(data: bytes) -> bytes:
 
 @dataclass(frozen=True)
 class Area:
-    """A rectangle of ``num_i`` by ``num_j`` squares of ``comms.tiles``, from the square (i, j) on."""
+    """A rectangle of ``num_i`` by ``num_j`` squares of ``comms.network.tiles``, from the square (i, j) on."""
 
     i: int
     j: int
@@ -67,7 +67,7 @@ class Area:
 
     def contains(self, x: float, y: float) -> bool:
         """Return whether a position in the world, metres, is in the rectangle."""
-        tile = Tile.at(x, y)
+        tile = NetworkTile.at(x, y)
         return 0 <= tile.i - self.i < self.num_i and 0 <= tile.j - self.j < self.num_j
 
     def is_within(self, other: Area) -> bool:

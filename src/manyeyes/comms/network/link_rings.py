@@ -7,7 +7,7 @@ import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable
 
-from manyeyes.comms.network import Origin, ReceivedPacket
+from manyeyes.comms.network.interface import Origin, ReceivedPacket
 
 RING_PACKETS = 128
 """Packets that are kept of a link; the oldest gives way. A message has at most a few."""

@@ -10,7 +10,7 @@ offset bytes    meaning
 2      1        suite: 1 is Ed25519 (RFC 8032)
 3      1        flags: bit 0 a certificate is attached, others zero
 4      8        signer: the last 8 bytes of the SHA-256 of its certificate
-12     0 or 126 certificate (``comms.certificate``)
+12     0 or 126 certificate (``comms.signatures.certificate``)
 ...    ...      the packet, unchanged, from ``ME`` to its checksum
 end-64 64       signature of ``CONTEXT`` and everything before it
 ====== ======== =======================================================================================
@@ -25,8 +25,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from manyeyes.comms.certificate import CERTIFICATE_BYTES, IDENTIFIER_BYTES, SIGNATURE_BYTES
 from manyeyes.comms.primitives import PacketError
+from manyeyes.comms.signatures.certificate import CERTIFICATE_BYTES, IDENTIFIER_BYTES, SIGNATURE_BYTES
 
 MAGIC = b"MS"
 ED25519 = 1
