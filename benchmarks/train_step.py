@@ -223,10 +223,17 @@ def main(argv: Sequence[str] | None = None) -> None:
         for worker in (old, new):
             worker.close()
         print(preset, json.dumps(results[preset], indent=1))
+    from manyeyes.studies.provenance import git_commit
+
+    # Folders of this machine mean nothing elsewhere.
+    words = [Path(word).name if word.startswith("/") else word for word in (sys.argv[1:] if argv is None else argv)]
+    load = [round(value, 1) for value in os.getloadavg()]
     content = {
-        "command": shlex.join(["python", "benchmarks/train_step.py", *(sys.argv[1:] if argv is None else argv)]),
+        "command": shlex.join(["python", "benchmarks/train_step.py", *words]),
         "baseline": args.baseline,
+        "commit": git_commit(),
         "machine": {"processor": platform.processor() or platform.machine(), "python": platform.python_version()},
+        "load_average": dict(zip(("1_min", "5_min", "15_min"), load)),
         "bar": BAR,
         "presets": results,
     }
