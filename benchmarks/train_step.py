@@ -7,6 +7,9 @@ the samples of a batch, forward, backward, optimiser step, moving average. The r
 interval by a bootstrap over steps. Before that, both compute loss and gradients of the same batches at the same weights: the
 difference of a batch is the norm of that of all gradients over the norm of the older gradients; the worst tensor is stated too.
 
+Samples are those of each version. A baseline before 251ae3d, as the default one, does not level them, so that its losses and
+gradients differ: ``--batches 0`` leaves their comparison out. It is meant for baselines of equal samples.
+
 Sensors are those of the recording. It holds eight scenarios of carla-towns-small's training towns, and is simulated once.
 
 python benchmarks/train_step.py [--baseline COMMIT] [--presets costr-small/stage4 costr-small/stage1] [--steps 40] [--batches 6]
@@ -82,10 +85,10 @@ def work(preset: str, data: Path) -> None:
     if hasattr(config.augment, "sensors"):  # older versions have none
         config = replace(config, augment=replace(config.augment, sensors=None))
     task = DetectorTask(config, Opv2vRecording(data), start=weights)
+    _time_parts(task, spent)
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(task, Path(folder))
         trainer.step = task.steps // 2
-        _time_parts(task, spent)
         for line in sys.stdin:
             name, *given = line.split()
             if name == "step":

@@ -38,10 +38,19 @@ def make_twins(config, device) -> tuple[Detector, Detector]:
 
 
 @pytest.mark.parametrize(
-    "config",
-    [COSTR_TINY, pytest.param(COSTR_SMALL, marks=pytest.mark.slow), pytest.param(COSTR_OPV2V, marks=pytest.mark.slow)],
+    ("config", "tolerance"),
+    [
+        (COSTR_TINY, 5e-6),
+        pytest.param(COSTR_SMALL, 5e-6, marks=pytest.mark.slow),
+        pytest.param(COSTR_OPV2V, 1e-4, marks=pytest.mark.slow),
+    ],
 )
-def test_clouds_and_tokens_enter_and_boxes_and_tokens_leave_on_the_cpu(device, config):
+def test_clouds_and_tokens_enter_and_boxes_and_tokens_leave_on_the_cpu(device, config, tolerance):
+    """Results agree to a tolerance, relative to the largest number of each: some tens of float32's rounding.
+
+    Measured under emulation: at most 2e-6 of costr-tiny and costr-small. Untrained features of costr-opv2v grow to 1,300 through
+    its layers, so that softmax and proposals have large arguments, which amplify rounding: 3e-5.
+    """
     ours, theirs = make_twins(config, device)
     results, boxes, detected = [], [], []
     with torch.inference_mode():
@@ -60,10 +69,10 @@ def test_clouds_and_tokens_enter_and_boxes_and_tokens_leave_on_the_cpu(device, c
             values = own.features, own.sites.key, raw.to_rows(), score, fused.bev.features, fused.merged_proposals
             results.append((*values, refined.to_rows()))
     assert len(results[0][0]) > 100
-    largest = float(results[0][0].abs().max())  # of untrained features, of which rounding is a fraction
     for mine, its in zip(*results, strict=True):
-        assert its.device.type == "cpu" and type(its) is torch.Tensor
-        assert mine.shape == its.shape and torch.allclose(mine, its, atol=max(2e-4, 4e-6 * largest), rtol=1e-3)
+        assert its.device.type == "cpu" and type(its) is torch.Tensor and mine.shape == its.shape
+        bound = tolerance * float(mine.abs().max()) if mine.is_floating_point() else 0.0
+        assert float((mine - its).abs().max()) <= bound
     for mine, its in (boxes, detected):
         # Random weights score many boxes alike, so that rounding may change their order, and who suppresses whom.
         assert type(its.center) is torch.Tensor and its.label.device.type == "cpu" and len(mine) == len(its) > 10
