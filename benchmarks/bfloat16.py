@@ -62,7 +62,7 @@ def compare(weights: str, recording: Path) -> list[Row]:
     ]
     rows = []
     results = [
-        [a.compute_result() for a in found]
+        [result for tally in found for result in tally.compute_results()]
         for found in run_benchmarks(partial(Opv2vRecording, recording, "val"), configs, 1)
     ]
     for a, b in zip(*results):
