@@ -18,6 +18,7 @@ import json
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -100,6 +101,20 @@ def simulate_scenes(preset: str, root: Path) -> Path:
     jobs = make_jobs(replace(simulation_preset(name), splits=SPLITS, frames=FRAMES), 0)
     record(jobs, folder, 1, None, {"preset": f"{name}, splits of benchmarks/preset_steps.py", "seed": 0})
     return folder
+
+
+def format_table(rows: list[dict[str, Any]]) -> str:
+    """Return the table of a page in Markdown: AP of both networks of one preset."""
+    lines = [
+        "| network | steps | AP@0.5 intermediate | AP@0.5 no fusion | CPU time of a step [s] |",
+        "|---|---|---|---|---|",
+    ]
+    for row in rows:
+        name = f"`{row['preset']}`" if row["network"] == "preset" else "small network, same range"
+        ap, seconds = row["ap50"], row["cpu_s_per_step"]
+        shown = "" if seconds is None else f"{seconds:.2f}"
+        lines.append(f"| {name} | {row['steps']} | {ap['intermediate']:.3f} | {ap['none']:.3f} | {shown} |")
+    return "\n".join(lines)
 
 
 def main() -> None:

@@ -2,6 +2,7 @@
 """The guides of the published data sets: their tables of hours are those of the stored estimate, and they name what exists."""
 
 import importlib.util
+import json
 import re
 import sys
 from pathlib import Path
@@ -50,3 +51,16 @@ def test_hours_follow_the_slower_of_host_and_device():
     assert ESTIMATE.device_ms(work, gpu) == pytest.approx(1000 * 2 / 35 + 10)
     rows = [line.split("|") for line in ESTIMATE.format_table(work).splitlines() if line.startswith("| H100")]
     assert [float(cell) for cell in rows[0][3:6]] == [4.1, 2.2, 2.2]
+
+
+def test_the_table_of_steps_is_that_of_the_stored_runs():
+    spec = importlib.util.spec_from_file_location("preset_steps", ROOT / "benchmarks" / "preset_steps.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    rows = json.loads((ROOT / "benchmarks" / "results" / "preset_steps.json").read_text(encoding="utf-8"))["result"]
+    pages = {dataset.preset: dataset.page for dataset in ESTIMATE.DATASETS}
+    for preset in {row["preset"] for row in rows}:
+        page = (ESTIMATE.GUIDES / pages[preset]).read_text(encoding="utf-8")
+        assert page.count(module.format_table([row for row in rows if row["preset"] == preset])) == 1
