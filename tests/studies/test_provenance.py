@@ -30,6 +30,7 @@ def test_the_file_holds_configuration_seed_versions_commit_and_result(tmp_path) 
     origin = held["provenance"]
     assert held["result"] == {"ap": 0.5, "curve": [1.0, None]}
     assert set(origin) == {"command", "config", "seed", "versions", "git_commit", "machine", "written"}
+    assert origin["machine"]["products"] == "float32"  # conftest.py switches bfloat16 off
     assert origin["config"] == {"folder": "a/b", "widths": [1, 2], "share": None} and origin["seed"] == 7
     assert origin["versions"]["torch"] == torch.__version__ and origin["versions"]["python"].startswith("3.")
     assert [p.name for p in path.parent.iterdir()] == ["result.json"]

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.resources import as_file, files
 from pathlib import Path
+from typing import Literal
 
 from torch import Tensor
 
@@ -20,6 +21,7 @@ from manyeyes.models.maps.map_model import MapModel, MapModelConfig
 from manyeyes.models.maps.presets import FORMAT
 from manyeyes.models.pose import feakm
 from manyeyes.models.token_peaks import read_token_peaks
+from manyeyes.ops._sparse_conv_kernels import HAS_BFLOAT16
 
 DEFAULT_DETECTOR = "costr-small"
 DEFAULT_FEAKM = "feakm-small"
@@ -78,6 +80,11 @@ def load(name_or_path: str | Path = DEFAULT_DETECTOR, *, in_bfloat16: bool | Non
         return detector
     with _weights_file(name, list_detectors()) as path:
         return fold_norms(checkpoint.load(path), _is_bfloat16_wanted() if in_bfloat16 is None else in_bfloat16)
+
+
+def product_type() -> Literal["bfloat16", "float32"]:
+    """Return the type in which weights that are loaded here multiply by default; sums are float32 in both."""
+    return "bfloat16" if HAS_BFLOAT16 and _is_bfloat16_wanted() else "float32"
 
 
 def _is_bfloat16_wanted() -> bool:

@@ -19,6 +19,7 @@ from typing import Any
 
 from manyeyes import __version__
 from manyeyes._io import atomic_write_text
+from manyeyes.models.pretrained import product_type
 
 RECORDED_PACKAGES = (
     "torch", "numpy", "numba", "safetensors", "tyro", "rich", "PyYAML", "zstandard", "eclipse-sumo", "libsumo",
@@ -75,7 +76,12 @@ def collect_provenance(config: object, seed: int | None) -> dict[str, Any]:
         "seed": seed,
         "versions": installed_versions(),
         "git_commit": git_commit(),
-        "machine": {"system": platform.platform(), "cpu": cpu_name(), "cores": os.cpu_count()},
+        "machine": {
+            "system": platform.platform(),
+            "cpu": cpu_name(),
+            "cores": os.cpu_count(),
+            "products": product_type(),
+        },
         "written": datetime.now(UTC).isoformat(timespec="seconds"),
     }
 
