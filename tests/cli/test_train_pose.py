@@ -66,7 +66,7 @@ def test_both_presets_train_on_the_same_kept_views(words, capsys):
     assert kept == {p: p.stat().st_mtime_ns for p in Path("runs/views").rglob("*.safetensors")}
     assert json.loads(Path("small/train.json").read_text())["result"]["weights"] == "weights.safetensors"
     assert cli.main([*words, "feakm-small", "--steps", "3", "--out", "small"]) == 1
-    assert "the seed is" in capsys.readouterr().err
+    assert "steps is 2 there and 3 here" in capsys.readouterr().err
 
 
 def test_an_unknown_preset_lists_these_too(words, capsys):

@@ -30,6 +30,6 @@ def test_an_own_fusion_module_is_trained_and_evaluated_with_an_own_strategy(
     assert [row["method"] for row in rows] == ["moving-first", "intermediate"]
 
     # Without the entry points neither name is known.
-    assert "No fusion module is called 'mean'; known: fast" in manyeyes(None, *train, "--fusion", "mean").stderr
+    assert "No fusion module is called 'mean'; known: attfuse" in manyeyes(None, *train, "--fusion", "mean").stderr
     unknown = manyeyes(None, *words)
     assert unknown.returncode == 1 and "No strategy is called 'moving-first'; known: early" in unknown.stderr

@@ -50,6 +50,13 @@ demo --budget-bytes -1 | --budget-bytes
 demo --latency-budget-ms nan | --latency-budget-ms
 demo --latency-budget-ms -5 | --latency-budget-ms
 demo --latency-budget-ms 1e300 | --latency-budget-ms
+live run {{rec}} --rate 0 | --rate
+live demo --rate nan | --rate
+live demo --agents 0 | --agents
+keys anchor --days 0 | --days
+keys issue stem --lifetime-min 0 | --lifetime-min
+keys pool --out pool --count 0 | --count
+keys demo --agents -1 | --agents
 simulate --workers 0 | --workers
 simulate --workers 1000000000 | --workers
 simulate --seed 0.5 | --seed
@@ -193,6 +200,16 @@ evaluate --data {damaged} --split test --weights {weights} --workers 1 | vehicle
 replay {damaged} --split test --weights {weights} | vehicles
 replay {text} | {text}
 export {missing} | {missing}
+report docs --root {missing} | {missing}
+study main-table --data {missing} | {missing}
+live run {missing} | {missing}
+live replay {missing} | {missing}
+live replay {text} | no whole recording
+keys issue stem --issuer {missing} | {missing}
+keys revoke {text} | no certificate
+keys trust {missing} | {missing}
+keys show {text} | no certificate
+keys verify {missing} | {missing}
 export {rec} --split test --scenario zz | zz
 export {rec} --split test --out {text} | {text}
 export {damaged} --split test --weights {weights} | vehicles

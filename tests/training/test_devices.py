@@ -107,9 +107,10 @@ def test_a_run_goes_on_on_another_device_and_back(toy, tmp_path, device):
         assert len(tensors) > 100 and all(
             type(value) is torch.Tensor and value.device.type == "cpu" for value in tensors
         )
-    # Measured under emulation: equal losses, and 4e-6.
-    assert moved == pytest.approx(losses, rel=1e-5)
-    assert divergence(weights_of(run), weights_of(whole), begun) < 1e-4
+    # Rounding may decide which cells are kept, and the runs part from there: measured under emulation up to 1.2e-4 and 2.9e-3.
+    # Where the moments of the optimiser are lost at each change of device, it is 8e-3 and 3.2e-2.
+    assert moved == pytest.approx(losses, rel=1e-3)
+    assert divergence(weights_of(run), weights_of(whole), begun) < 0.01
 
 
 def test_training_on_a_device_gives_the_weights_of_the_cpu(toy, tmp_path, device):
