@@ -34,5 +34,11 @@ def test_a_map_that_cannot_be_written_leaves_the_report(tmp_path: Path, capsys: 
     )
     assert cli.main([*words, "--towns", str(tmp_path)]) == 1
     assert str(out / "map") in capsys.readouterr().err
-    assert {p.name for p in out.iterdir()} >= {"report.html", "results.json", "results.md", "no-fusion.png", "early.png"}
+    assert {p.name for p in out.iterdir()} >= {
+        "report.html",
+        "results.json",
+        "results.md",
+        "no-fusion.png",
+        "early.png",
+    }
     assert len(json.loads((out / "results.json").read_text())["result"]["rows"]) == 4
