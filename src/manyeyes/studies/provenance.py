@@ -19,7 +19,6 @@ from typing import Any
 
 from manyeyes import __version__
 from manyeyes._io import atomic_write_text
-from manyeyes.models.pretrained import product_type
 
 RECORDED_PACKAGES = (
     "torch", "numpy", "numba", "safetensors", "tyro", "rich", "PyYAML", "zstandard", "eclipse-sumo", "libsumo",
@@ -70,6 +69,8 @@ def cpu_name() -> str:
 
 def collect_provenance(config: object, seed: int | None) -> dict[str, Any]:
     """What a reader needs to get the same numbers again. config: a dataclass or plain values."""
+    from manyeyes.models.pretrained import product_type  # brings torch, which 'doctor --help' need not import
+
     return {
         "command": shlex.join([*_program(sys.argv[0]), *sys.argv[1:]]),
         "config": to_plain(config),
