@@ -38,7 +38,7 @@ from torch import Tensor
 from manyeyes.agents.agent import Agent
 from manyeyes.agents.own_detections import remove_own_body
 from manyeyes.agents.perception_cache import PerceptionCache, TokenOutput
-from manyeyes.agents.strategies.intermediate_temporal import gather_ego_tokens
+from manyeyes.agents.strategies.intermediate import gather_tokens
 from manyeyes.agents.strategies.message_header import make_header
 from manyeyes.agents.strategies.redundancy import novelty_score
 from manyeyes.comms import wire
@@ -141,7 +141,7 @@ def random_detector(config: DetectorConfig, frames: list[AgentFrame]) -> Detecto
     norms = [m for m in model.modules() if isinstance(m, ActiveNorm)]
     momenta = [m.momentum for m in norms]
     for norm in norms:
-        norm.momentum = None  # pyright: ignore[reportAttributeAccessIssue]
+        norm.momentum = 1.0
     cache = PerceptionCache(model.train())
     with torch.inference_mode():
         cache.run_detector(frames[0].points)
@@ -273,14 +273,14 @@ def staged(model: Detector, frames: list[AgentFrame], kept: list[Kept] | None) -
         message = replace(make_header(frame, model.fingerprint), tokens=some, token_score=score)
         messages.append(wire.encode(message, token_encoding="float16"))
         stopwatch.lap("to bytes")
-        own = own or shared_tokens
+        own = own or cache
     assert own is not None
     inbox = Inbox(model.fingerprint)
     for packet in (p for packets in messages[1:] for p in packets):
         inbox.push(packet)
     messages_received = inbox.messages()
     stopwatch.lap("from bytes")
-    together, _ = gather_ego_tokens(frames[0], own, (), messages_received)
+    together = gather_tokens(own, frames[0], messages_received)
     fused = model.fusion(together)
     stopwatch.lap("gather, FAST")
     raw = model.refine(fused.bev, fused.merged_proposals)

@@ -60,7 +60,7 @@ PRESENT_STAGES = (
     ("reception", "comms.inbox", "Inbox.received_messages"),
     ("reception", "agents.agent", "decode_tokens"),
     ("pose correction", "agents.pose_correction", "PoseCorrection.correct"),
-    ("transform", "agents.strategies.intermediate_temporal", "gather_ego_tokens"),
+    ("transform", "agents.strategies.intermediate", "gather_with_past"),
     ("fusion", "agents.perception_cache", "PerceptionCache.fuse"),
     ("decoding", "agents.perception_cache", "PerceptionCache.decode"),
     ("own boxes kept", "agents.agent", "restore_own_boxes"),

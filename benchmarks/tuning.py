@@ -20,8 +20,9 @@ import torch
 
 from manyeyes import Agent, Opv2vRecording, load_detector
 from manyeyes.agents.perception_cache import AgentOutput, PerceptionCache
-from manyeyes.agents.strategies.intermediate_temporal import TemporalIntermediateFusion
+from manyeyes.agents.strategies.intermediate import IntermediateFusion
 from manyeyes.agents.strategies.late import LateFusion
+from manyeyes.agents.strategies.redundancy import novelty_score
 from manyeyes.agents.strategies.registry import FusionStrategy
 from manyeyes.datatypes import AgentFrame, Boxes, Snapshot
 from manyeyes.evaluation.detection.average_precision import (
@@ -104,7 +105,7 @@ def main() -> None:
             truth = select_ego_truth(snapshot, 0, protocol)
             for nms_iou, power in SETTINGS:
                 setting = replace(base, nms_iou=nms_iou, iou_score_weight=power)
-                for way in (LateFusion(nms_iou=nms_iou), TemporalIntermediateFusion()):
+                for way in (LateFusion(nms_iou=nms_iou), IntermediateFusion(novelty_score, uses_history=True)):
                     boxes = perceive(way, caches, setting, snapshot)
                     found[way.name, nms_iou, power].append(FrameResult(scenario, index, boxes, truth))
     rows = []

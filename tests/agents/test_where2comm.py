@@ -30,7 +30,7 @@ def request(sender, confidence: float) -> Message:
     return Message(9, frame.timestamp_ns, frame.world_from_agent, frame.pose_covariance, bytes(8), request=wide)
 
 
-def test_nobody_and_an_empty_street_leave_the_order_of_confidence(sender) -> None:
+def test_no_sender_and_an_empty_street_leave_the_order_of_confidence(sender) -> None:
     score = sender[3]
     kept = score > MIN_SCORE
     for requests in ((), (request(sender, 0.0),)):

@@ -20,7 +20,7 @@ def test_types_of_real_recordings() -> None:
     assert find_label("TrashCan") is None and find_label("Cone") is None
 
 
-def test_names_are_told_by_their_letters_alone() -> None:
+def test_names_are_distinguished_by_their_letters_alone() -> None:
     bus = LABELS.index("bus")
     assert find_label("BUS") == find_label(" Bus ") == bus
     assert find_label("EMERGENCY_VEHICLE") == LABELS.index("van")

@@ -88,6 +88,6 @@ def test_a_token_stands_on_its_own_cell_whatever_it_proposes() -> None:
 
 
 def test_no_tokens_have_no_cells() -> None:
-    nobody = tokens_of(draw_agent(0, False, n=0), batch_size=2)
-    rows, _ = gather_by_cell(nobody.features, nobody, standing_cells(nobody))
+    empty = tokens_of(draw_agent(0, False, n=0), batch_size=2)
+    rows, _ = gather_by_cell(empty.features, empty, standing_cells(empty))
     assert len(rows.sites) == 0 and rows.count.tolist() == [1, 1] and rows.with_own_everywhere() is rows

@@ -77,7 +77,7 @@ def test_wheels_stand_on_the_road() -> None:
     assert np.abs(placed[..., 2] - height_at(ground, placed[..., :2])).max() < 0.05
 
 
-def test_nobody_stands_nowhere() -> None:
+def test_an_empty_fleet_is_placed() -> None:
     assert len(stand_on_ground(VehicleStates.empty(), street())) == 0
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Devices of a run by name, without a GPU: torch is told how many it finds."""
+"""Devices of a run by name, without a GPU: the number that torch finds is set."""
 
 from __future__ import annotations
 

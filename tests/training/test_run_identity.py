@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Runs are told apart by settings, seed and initial weights, and runs of older code go on."""
+"""Runs are distinguished by settings, seed and initial weights, and runs of older code go on."""
 
 import json
 from dataclasses import replace

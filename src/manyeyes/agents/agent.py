@@ -22,8 +22,9 @@ from manyeyes.agents.pose_plausibility import (
     find_pose_fault,
     with_unknown_pose,
 )
-from manyeyes.agents.strategies.intermediate_temporal import TemporalIntermediateFusion
+from manyeyes.agents.strategies.intermediate import IntermediateFusion
 from manyeyes.agents.strategies.message_header import make_header
+from manyeyes.agents.strategies.redundancy import novelty_score
 from manyeyes.agents.strategies.registry import FusionStrategy
 from manyeyes.agents.strategies.request_maps import make_request_map
 from manyeyes.agents.token_codec import (
@@ -112,7 +113,7 @@ class Agent:
         self._sender_states: Mapping[int, SenderState] = {}
         self._accepted_poses: AcceptedPoses = {}
         self._known_senders: KnownSenders = {}
-        self.strategy = strategy or TemporalIntermediateFusion()
+        self.strategy = strategy or IntermediateFusion(novelty_score, uses_history=True)
         self._quarantine = Quarantine()
         self.limits = ReceiverLimits() if self.strategy.uses_points else ReceiverLimits(max_points=0)
         if self.strategy.needs_tokens:

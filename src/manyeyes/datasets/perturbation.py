@@ -44,14 +44,14 @@ class PoseNoise:
 
     in_time: how the error of an agent goes on, with the same variance at every instant: ``autoregressive`` is of first order,
     autocorrelation exp(-|lag| / correlation_time_s) (``ops.keyed_autoregressive``); ``constant`` is one error for a scenario
-    (SparseAlign); ``independent`` is drawn again in each frame (CoAlign), which whoever remembers averages out.
+    (SparseAlign); ``independent`` is drawn again in each frame (CoAlign), which methods with memory average out.
 
     claim: standard deviation that agents add to their pose covariance, as a factor of the true one (CLAIM_FACTORS): the
-    covariance weighs the fusion, and real agents seldom know it.
+    covariance weighs the fusion, and real agents seldom have it.
 
     The three standard normals of an agent follow from (seed, scenario, agent) and its time (``autoregressive``) or its frame
-    (``independent``), whoever else is there, and are scaled: the same unit draw at every level, so that curves over levels are
-    paired, and both modes agree on the collaborators.
+    (``independent``), whichever agents are present, and are scaled: the same unit draw at every level, so that curves over levels
+    are paired, and both modes agree on the collaborators.
     """
 
     mode: NoiseMode = "collaborators"

@@ -18,7 +18,7 @@ SOURCES = {
     "validation": "of greatest F on validation data (--thresholds)",
     "default": "default of weights without calibration, chosen for no method",
 }
-"""What a table says of each source of thresholds."""
+"""Text of a table for each source of thresholds."""
 HEADINGS = (
     "method", "threshold", "precision", "recall", "F", "false alarms/frame", "duplicates/object", "legacy AP@0.5", "legacy AP@0.7",
 )  # fmt: skip

@@ -12,7 +12,6 @@ from manyeyes.agents.agent import Agent
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.early import MIN_POINT_LIMIT, merge_clouds
 from manyeyes.agents.strategies.intermediate import IntermediateFusion
-from manyeyes.agents.strategies.intermediate_temporal import TemporalIntermediateFusion
 from manyeyes.agents.strategies.names import TEMPORAL
 from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, Message, PointCloud, Transform
@@ -97,7 +96,7 @@ def test_intermediate_fusion_takes_own_past_tokens_in_its_temporal_form_alone(de
     counts = [len(o.shared_tokens.sites) for o in outputs]
     tokens, past = IntermediateFusion().gather(cache, frames[2], ())
     assert past is None and len(tokens.xy) == counts[2] and not tokens.age.any()
-    tokens, past = TemporalIntermediateFusion().gather(cache, frames[2], ())
+    tokens, past = IntermediateFusion(uses_history=True).gather(cache, frames[2], ())
     assert past is not None and len(tokens.xy) == sum(counts) and len(past.xy) == sum(counts[:2])
 
 
@@ -123,5 +122,5 @@ def test_one_frame_alone_is_the_same_in_both_forms(detector, name) -> None:
 def test_memory_does_not_need_the_frame_to_be_processed_before(detector) -> None:
     cache = PerceptionCache(detector)
     counts = [len(cache.process_tokens(sweep(k)).shared_tokens.sites) for k in range(2)]
-    _, past = TemporalIntermediateFusion().gather(cache, sweep(2), ())
+    _, past = IntermediateFusion(uses_history=True).gather(cache, sweep(2), ())
     assert past is not None and len(past.xy) == sum(counts)

@@ -192,7 +192,7 @@ def test_a_frame_that_lacks_a_file_is_left_out_and_named(tmp_path: Path, gone: s
     assert text in recording.missing_summary[0]
 
 
-def test_a_sequence_without_poses_says_so(tmp_path: Path) -> None:
+def test_a_sequence_without_poses_is_an_error_that_names_the_file(tmp_path: Path) -> None:
     write_odometry(tmp_path, poses=False)
     with pytest.raises(RecordingError, match=r"poses/07\.txt.*Download"):
         open_recording(tmp_path)

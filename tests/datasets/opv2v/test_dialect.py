@@ -170,7 +170,7 @@ def test_arrays_of_numpy_2_are_read_as_those_of_numpy_1(tmp_path: Path) -> None:
     check_scene(Opv2vRecording(tmp_path), "a")
 
 
-def test_v2v4real_is_told_by_content_where_names_do_not_tell(tmp_path: Path) -> None:
+def test_v2v4real_is_recognised_by_content_where_names_do_not_differ(tmp_path: Path) -> None:
     recording = Opv2vRecording(write_v2v4real(tmp_path / "renamed"))
     assert recording.dialect("renamed") is V2V4REAL
     check_scene(recording, "renamed")

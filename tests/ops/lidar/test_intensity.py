@@ -57,7 +57,7 @@ def test_low_gain_rounds_to_eight_bits():
     material = stored(INTENSITY_LAWS["material"])
     expected = [round(float(value) * 0.03 * 255) / 255 for value in material]
     torch.testing.assert_close(stored(INTENSITY_LAWS["low-gain-8bit"]), torch.tensor(expected))
-    assert len(set(expected)) > 2, "the case tells levels apart"
+    assert len(set(expected)) > 2, "the case has several levels"
 
 
 def test_gain_gamma_is_a_curve_of_the_material():

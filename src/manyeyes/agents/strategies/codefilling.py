@@ -18,7 +18,6 @@ from torch import Tensor
 
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.intermediate import IntermediateFusion, confidence_score
-from manyeyes.agents.strategies.intermediate_temporal import TemporalIntermediateFusion
 from manyeyes.agents.strategies.message_header import make_header
 from manyeyes.agents.strategies.registry import register_strategy
 from manyeyes.agents.strategies.request_maps import make_request_map
@@ -83,14 +82,5 @@ class CodeFillingFusion(IntermediateFusion):
     needs_request_map = True
 
 
-class TemporalCodeFillingFusion(TemporalIntermediateFusion):
-    """The same with memory."""
-
-    needs_request_map = True
-
-
-for name, strategy in (
-    ("intermediate-codefilling", CodeFillingFusion),
-    ("intermediate-codefilling-temporal", TemporalCodeFillingFusion),
-):
-    register_strategy(name)(partial(strategy, score=confidence_score, weigh=weigh_by_filling))
+for name, uses_history in (("intermediate-codefilling", False), ("intermediate-codefilling-temporal", True)):
+    register_strategy(name)(partial(CodeFillingFusion, confidence_score, uses_history, weigh=weigh_by_filling))

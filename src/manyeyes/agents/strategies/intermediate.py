@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Intermediate fusion: every agent sends tokens; the ego moves them into its frame and fuses them (CoSTr Eq. 1).
 
-Without memory: the ego's tokens of the present sweep and the newest message of each sender. ``intermediate_temporal`` remembers.
+Without history: the ego's tokens of the present sweep and the newest message of each sender. With it (the forms ``-temporal``, and
+the default of agents): also the tokens of the last two frames, own and received ones.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ from torch import Tensor
 
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.message_header import age_s, make_header
-from manyeyes.agents.strategies.redundancy import distinct_score
+from manyeyes.agents.strategies.redundancy import distinct_score, novelty_score
 from manyeyes.agents.strategies.registry import FusionStrategy, register_strategy
+from manyeyes.agents.token_codec import has_token_history
 from manyeyes.comms.request_map import compute_request_weights
 from manyeyes.datatypes import AgentFrame, Boxes, Message, SparseBev, Transform
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat
@@ -59,10 +61,12 @@ def weigh_by_requests(
 class IntermediateFusion(FusionStrategy):
     """Fusion of tokens of the ego's own weights; the inbox rejects others.
 
-    score: order in which a budget keeps tokens. weigh: how requests of receivers change it.
+    score: order in which a budget keeps tokens. uses_history: the tokens of the last two frames are fused too; receivers then have
+    earlier tokens, which novelty_score takes into account. weigh: how requests of receivers change the scores.
     """
 
     score: Callable[[PerceptionCache, AgentFrame], Tensor] = distinct_score
+    uses_history: bool = False
     needs_tokens: bool = True
     uses_points = False
     score_form = "fused"
@@ -92,12 +96,15 @@ class IntermediateFusion(FusionStrategy):
         self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]
     ) -> tuple[Tokens, Tokens | None]:
         """Return the tokens that are fused, and the ego's own past ones among them, if any."""
+        if self.uses_history:
+            return gather_with_past(cache, frame, messages)
         return gather_tokens(cache, frame, messages), None
 
 
-register_strategy("intermediate-mi")(partial(IntermediateFusion, mask_score))
-register_strategy("intermediate-confidence")(partial(IntermediateFusion, confidence_score))
-register_strategy("intermediate-random")(partial(IntermediateFusion, random_score))
+register_strategy("intermediate-temporal")(partial(IntermediateFusion, novelty_score, uses_history=True))
+for name, score in (("mi", mask_score), ("confidence", confidence_score), ("random", random_score)):
+    register_strategy(f"intermediate-{name}")(partial(IntermediateFusion, score))
+    register_strategy(f"intermediate-{name}-temporal")(partial(IntermediateFusion, score, uses_history=True))
 
 
 def gather_tokens(
@@ -113,6 +120,15 @@ def gather_tokens(
     received = [_to_agent_tokens(frame, ego_from_world, message, tokens) for message, tokens in on_grid]
     current = AgentTokens(0, own.features, own.sites.xy, is_infrastructure=frame.is_infrastructure)
     return to_ego_frame([current, *received, *past], own.grid, 1)
+
+
+def gather_with_past(
+    cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]
+) -> tuple[Tokens, Tokens | None]:
+    """Return the ego's current and past tokens with those of every message on the same lattice; and its own past tokens alone."""
+    grid = cache.process_tokens(frame).shared_tokens.grid
+    past = cache.previous_tokens(frame) if has_token_history(cache.detector) else []
+    return gather_tokens(cache, frame, messages, past), to_ego_frame(past, grid, 1) if past else None
 
 
 def _to_agent_tokens(frame: AgentFrame, ego_from_world: Transform, message: Message, tokens: SparseBev) -> AgentTokens:

@@ -6,20 +6,18 @@ Information of agent A returns to A through B, counted twice and two messages ol
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
-from torch import Tensor
 
 from manyeyes.agents.perception_cache import PerceptionCache, is_consecutive
 from manyeyes.agents.strategies.intermediate import IntermediateFusion
-from manyeyes.agents.strategies.intermediate_temporal import gather_ego_tokens
 from manyeyes.agents.strategies.message_header import make_header
 from manyeyes.agents.strategies.redundancy import novelty_score
 from manyeyes.agents.strategies.registry import register_strategy
 from manyeyes.datatypes import AgentFrame, Boxes, Message
-from manyeyes.models.fusion.transform_tokens import Tokens
 
 
 @register_strategy("intermediate-multihop")
@@ -47,16 +45,4 @@ class MultiHopFusion(IntermediateFusion):
         return cache.decode(raw)
 
 
-@register_strategy("intermediate-multihop-temporal")
-@dataclass(frozen=True)
-class TemporalMultiHopFusion(MultiHopFusion):
-    """The same with the tokens of the last two frames, own and received ones."""
-
-    score: Callable[[PerceptionCache, AgentFrame], Tensor] = novelty_score
-    uses_history: bool = True
-
-    def gather(
-        self, cache: PerceptionCache, frame: AgentFrame, messages: Sequence[Message]
-    ) -> tuple[Tokens, Tokens | None]:
-        """Return the tokens of messages and of the agent's last three frames; and its past ones alone."""
-        return gather_ego_tokens(cache, frame, messages)
+register_strategy("intermediate-multihop-temporal")(partial(MultiHopFusion, novelty_score, uses_history=True))

@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 TEMPORAL = "-temporal"
-"""End of the names of strategies that remember."""
+"""End of the names of strategies with memory."""
 FORMER_NAMES = {"none": "no-fusion"}
-"""Names that strategies had in stored commands and results, with today's. A stored row ``intermediate`` of before the two forms
-were told apart is today's ``intermediate-temporal``."""
+"""Names that strategies had in stored commands and results, with today's. A stored row ``intermediate`` of before methods had
+two forms is today's ``intermediate-temporal``."""
 
 
 def current_name(name: str) -> str:

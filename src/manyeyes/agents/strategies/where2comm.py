@@ -15,7 +15,6 @@ from torch import Tensor
 
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.intermediate import IntermediateFusion, confidence_score
-from manyeyes.agents.strategies.intermediate_temporal import TemporalIntermediateFusion
 from manyeyes.agents.strategies.registry import register_strategy
 from manyeyes.comms.request_map import compute_request_weights
 from manyeyes.datatypes import AgentFrame, Message, SparseBev
@@ -39,7 +38,7 @@ def smoothed_confidence(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
 def weigh_by_demand(
     cache: PerceptionCache, frame: AgentFrame, tokens: SparseBev, score: Tensor, requests: Sequence[Message]
 ) -> Tensor:
-    """Weigh the scores (N,) of tokens by 1 - confidence of the receiver that requests most; what nobody requests is not sent."""
+    """Weigh the scores (N,) of tokens by 1 - confidence of the receiver that requests most; unrequested tokens are not sent."""
     weights = compute_request_weights(tokens.sites.xy, frame.world_from_agent, requests, min_weight=0.0)
     weighted = score * weights
     return torch.where(weighted > MIN_SCORE, weighted, -torch.inf)
@@ -51,14 +50,5 @@ class Where2commFusion(IntermediateFusion):
     needs_request_map = True
 
 
-class TemporalWhere2commFusion(TemporalIntermediateFusion):
-    """The same with memory."""
-
-    needs_request_map = True
-
-
-for name, strategy in (
-    ("intermediate-where2comm", Where2commFusion),
-    ("intermediate-where2comm-temporal", TemporalWhere2commFusion),
-):
-    register_strategy(name)(partial(strategy, score=smoothed_confidence, weigh=weigh_by_demand))
+for name, uses_history in (("intermediate-where2comm", False), ("intermediate-where2comm-temporal", True)):
+    register_strategy(name)(partial(Where2commFusion, smoothed_confidence, uses_history, weigh=weigh_by_demand))

@@ -96,7 +96,8 @@ def _run_team(options: Options, console: Console) -> None:
     rate = _run_processes(commands, options, console)
     files = [options.out / f"agent-{agent}.json" for agent in agents]
     print_summaries([load_summary(file) for file in files], console)
-    pace = "in real time" if rate == 1 else f"at {rate:.3g} of real time: that many agents do not fit on these cores"
+    reason = "as given" if options.rate else "that many agents do not fit on these cores"
+    pace = "in real time" if rate == 1 else f"at {rate:.3g} of real time: {reason}"
     console.print(f"{len(agents)} processes, {options.transport}, security {options.security}, {pace}", soft_wrap=True)
     for agent in agents if options.check else ():
         console.print(check_run(options.out / f"agent-{agent}.mcap"), highlight=False, markup=False, soft_wrap=True)

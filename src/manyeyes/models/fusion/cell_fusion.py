@@ -48,7 +48,7 @@ class BareFusion(nn.Module):
     """Mode bare: the rule alone.
 
     Attributes:
-        is_bare: tells the detector to send features alone, and to decode boxes from the fused features.
+        is_bare: the detector sends features alone, and decodes boxes from the fused features.
         sends_confidence: the rule needs the confidence of the senders; it is one more column of a token.
     """
 

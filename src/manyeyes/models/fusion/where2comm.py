@@ -23,7 +23,7 @@ class Where2comm(nn.Module):
     """Multi-head attention over the senders of a cell, residual, norm, two linear layers, residual, norm.
 
     The weight of each sender is multiplied by its confidence on the cell. Keys hold the position in the sender's own frame, in
-    cells, which tells the distance to its sensor. renormalise: weights add up to one again after that, unlike in the paper.
+    cells, which states the distance to its sensor. renormalise: weights add up to one again after that, unlike in the paper.
     An absent sender, where it is a row of zeros, has confidence zero: it takes part in the softmax alone.
     """
 

@@ -134,7 +134,7 @@ def run(options: RobustnessOptions, context: StudyContext) -> None:
 
 
 def _result_key(perturbation: Perturbation, method: str, baselines: Sequence[str]) -> ResultKey:
-    """Return the result key of a method, or of a baseline's weights, with memory if its name says so."""
+    """Return the result key of a method, or of a baseline's weights, with memory if its name ends in ``-temporal``."""
     if method not in baselines:
         return perturbation.name, method
     return f"{method.removesuffix(TEMPORAL)}: {perturbation.name}", OURS + form_of(method)
