@@ -19,7 +19,11 @@ def test_layers_are_those_of_the_import_contract() -> None:
 
 def test_extension_points_are_the_groups_of_entry_points_of_the_code() -> None:
     sources = "".join(path.read_text() for path in (ROOT / "src" / "manyeyes").rglob("*.py"))
-    groups = set(re.findall(r'"(manyeyes\.(?:fusion|strategy|detector|dataset|pose_corrector|map_fusion))"', sources))
+    groups = set(
+        re.findall(
+            r'"(manyeyes\.(?:fusion|strategy|detector|dataset|pose_corrector|map_fusion|misbehaviour))"', sources
+        )
+    )
     assert groups and set(re.findall(r"`(manyeyes\.\w+)`", TEXT.partition("## Extension points")[2])) == groups
     for name in re.findall(r"`(register_\w+)\(", TEXT):
         assert re.search(rf"^(?:def )?{name}\b", sources, re.MULTILINE), name

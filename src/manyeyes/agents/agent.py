@@ -20,6 +20,7 @@ from manyeyes.agents.pose_plausibility import (
     AcceptedPoses,
     accept_poses,
     find_pose_fault,
+    has_known_pose,
     with_unknown_pose,
 )
 from manyeyes.agents.strategies.intermediate import IntermediateFusion
@@ -37,6 +38,10 @@ from manyeyes.agents.token_codec import (
     require_codebook,
     unpack_tokens,
 )
+from manyeyes.agents.trust.claims import extract_claims
+from manyeyes.agents.trust.fusion_weights import weigh_received
+from manyeyes.agents.trust.interface import Assessment, MisbehaviourDetector, MisbehaviourInput
+from manyeyes.agents.trust.result_evidence import ResultEvidence, bound_scores, find_result_evidence
 from manyeyes.comms import wire
 from manyeyes.comms.admission import Authenticator
 from manyeyes.comms.agent_body import count_agent_body_bytes
@@ -60,12 +65,15 @@ class Perception:
     boxes: in the agent's frame, by falling score, which is calibrated where the weights are (``models.score_calibration``).
     received: the fused messages by agent id, with their corrected poses. corrections: one for each received message, where the
     agent corrects poses, between levelled frames. rejected: senders whose content was excluded, wholly or in part, with the reason.
+    assessment: of the senders, where the agent has a misbehaviour detector. evidence: on each box, where it assesses claims.
     """
 
     boxes: Boxes
     received: tuple[ReceivedMessage, ...]
     corrections: tuple[CorrectionOutcome, ...] = ()
     rejected: tuple[Rejection, ...] = ()
+    assessment: Assessment | None = None
+    evidence: ResultEvidence | None = None
 
 
 @dataclass(frozen=True)
@@ -76,6 +84,7 @@ class _State:
     sender_states: Mapping[int, SenderState]
     accepted_poses: AcceptedPoses
     history: History
+    assessment: Assessment | None
 
 
 @dataclass(frozen=True)
@@ -94,6 +103,7 @@ class Agent:
     send_request_map: messages with tokens carry a request map, one byte a window (``comms.request_map``).
     pose_correction: corrects prior poses of senders before fusion; None uses the prior poses. map_predictor: predicts the local map
     that the agent sends (``agents.map_perception``); None sends no map. token_format: of the tokens that the agent can fuse.
+    misbehaviour: assesses senders before fusion (``agents.trust``); None fuses all with weight 1.
     """
 
     def __init__(
@@ -106,10 +116,13 @@ class Agent:
         pose_correction: PoseCorrection | None = None,
         send_request_map: bool = False,
         map_predictor: MapPredictor | None = None,
+        misbehaviour: MisbehaviourDetector | None = None,
     ) -> None:
         check_detector(detector)
         self.perception_cache, self.message_history = perception_cache or PerceptionCache(detector), MessageHistory()
         self.pose_correction = pose_correction
+        self.misbehaviour = misbehaviour
+        self._assessment: Assessment | None = None
         self._sender_states: Mapping[int, SenderState] = {}
         self._accepted_poses: AcceptedPoses = {}
         self._known_senders: KnownSenders = {}
@@ -140,6 +153,8 @@ class Agent:
         to the packets before they are sent: packets leave room for it, and the budget includes it.
         """
         frame = self.perception_cache.level(frame).levelled
+        untrusted = self._find_excluded(requests, frame.timestamp_ns)
+        requests = [request for request in requests if request.agent_id not in untrusted]
         budget = min((b for b in (self.budget_bytes, budget_bytes) if b is not None), default=None)
         message = self._compose(frame, requests)
         if message is None:
@@ -225,7 +240,8 @@ class Agent:
                 checked, rejections = self._check(frame, reception, now_ns, inbox.limits)
                 received += [] if checked is None else [checked]
                 rejected += rejections
-        selected, left_out = select_for_fusion(frame, received, self._known_senders, inbox.limits)
+        untrusted = self._find_excluded([reception.message for reception in received], now_ns)
+        selected, left_out = select_for_fusion(frame, received, self._known_senders, inbox.limits, untrusted)
         perception, failed = self._perceive(frame, selected)
         for rejection in failed:
             inbox.discard(rejection.agent_id)
@@ -238,7 +254,11 @@ class Agent:
         boxes = calibrate_boxes(self.perception_cache.detector, self.strategy.score_form, perception.boxes)
         if level.levelled_from_agent is not None:
             boxes = boxes.transform(level.levelled_from_agent.inverse())
-        return replace(perception, boxes=boxes, rejected=(*rejected, *left_out, *failed))
+        evidence = perception.evidence
+        if evidence is not None:
+            boxes, evidence = bound_scores(boxes, evidence)
+        rejected += perception.rejected
+        return replace(perception, boxes=boxes, evidence=evidence, rejected=(*rejected, *left_out, *failed))
 
     def _check(
         self, frame: AgentFrame, reception: ReceivedMessage, now_ns: int, limits: ReceiverLimits
@@ -298,24 +318,71 @@ class Agent:
         try:
             stated = [reception.message for reception in received]
             self._accepted_poses = accept_poses(self._accepted_poses, stated, frame.timestamp_ns)
-            usable, corrections = self._correct_poses(frame, tuple(received))
+            watched = self._find_excluded(stated, frame.timestamp_ns)
+            corrected, corrections = self._correct_poses(
+                frame, tuple(r for r in received if r.message.agent_id not in watched)
+            )
+            excluded_senders = [r for r in received if r.message.agent_id in watched]
+            usable, distrusted = self._assess(frame, (*corrected, *excluded_senders), corrections)
             messages = [reception.message for reception in usable]
             if self.strategy.uses_history and has_token_history(self.perception_cache.detector):
                 untrusted = {correction.agent_id for correction in corrections if correction.untrusted}
-                messages = self.message_history.update_and_get(messages, frame.timestamp_ns, untrusted.union(excluded))
+                untrusted.update(excluded, (rejection.agent_id for rejection in distrusted))
+                messages = self.message_history.update_and_get(messages, frame.timestamp_ns, untrusted)
             boxes = self.strategy.fuse(self.perception_cache, frame, messages)
-            boxes = restore_own_boxes(boxes, self.perception_cache.process(frame).boxes)
-            return _Attempt(Perception(remove_own_body(boxes, frame), usable, corrections), self._state)
+            own = self.perception_cache.process(frame).boxes
+            boxes = remove_own_body(restore_own_boxes(boxes, own), frame)
+            evidence = find_result_evidence(boxes, own, self._assessment)
+            perception = Perception(boxes, usable, corrections, distrusted, self._assessment, evidence)
+            return _Attempt(perception, self._state)
         finally:
             self._restore(before)
 
+    def _find_excluded(self, messages: Sequence[Message], now_ns: int) -> frozenset[int]:
+        """Return the senders that the misbehaviour detector excludes by its state."""
+        if self.misbehaviour is None:
+            return frozenset()
+        state = None if self._assessment is None else self._assessment.state
+        return self.misbehaviour.excluded(state, [message.agent_id for message in messages], now_ns)
+
+    def _assess(
+        self, frame: AgentFrame, received: Sequence[ReceivedMessage], corrections: Sequence[CorrectionOutcome]
+    ) -> tuple[tuple[ReceivedMessage, ...], tuple[Rejection, ...]]:
+        """Return the messages that are fused, weighted by the trust in their senders; and the senders that are excluded."""
+        if self.misbehaviour is None:
+            return tuple(received), ()
+        cache = self.perception_cache
+        known = sorted((r for r in received if has_known_pose(r.message)), key=lambda r: r.message.agent_id)
+        messages = tuple(reception.message for reception in known)
+
+        def fuse(senders: Collection[int]) -> Boxes:
+            history = cache.history
+            try:
+                return self.strategy.fuse(cache, frame, [m for m in messages if m.agent_id in senders])
+            finally:
+                cache.history = history
+
+        content = MisbehaviourInput(
+            frame,
+            cache.process(frame).boxes,
+            messages,
+            lambda: extract_claims(frame, cache, messages),
+            fuse,
+            frozenset(correction.agent_id for correction in corrections if correction.is_faulty),
+        )
+        state = None if self._assessment is None else self._assessment.state
+        self._assessment = self.misbehaviour.assess(content, state)
+        return weigh_received(frame, known, self._assessment)
+
     @property
     def _state(self) -> _State:
-        return _State(self.message_history, self._sender_states, self._accepted_poses, self.perception_cache.history)
+        history = self.perception_cache.history
+        return _State(self.message_history, self._sender_states, self._accepted_poses, history, self._assessment)
 
     def _restore(self, state: _State) -> None:
         self.message_history, self._sender_states = state.message_history, state.sender_states
         self._accepted_poses, self.perception_cache.history = state.accepted_poses, state.history
+        self._assessment = state.assessment
 
     def _correct_poses(
         self, frame: AgentFrame, received: tuple[ReceivedMessage, ...]

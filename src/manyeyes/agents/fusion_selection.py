@@ -33,18 +33,24 @@ def first_fusion_ns(known: KnownSenders, agent_id: int) -> float:
 
 
 def select_for_fusion(
-    frame: AgentFrame, received: Sequence[ReceivedMessage], known: KnownSenders, limits: ReceiverLimits
+    frame: AgentFrame,
+    received: Sequence[ReceivedMessage],
+    known: KnownSenders,
+    limits: ReceiverLimits,
+    untrusted: Collection[int] = (),
 ) -> tuple[list[ReceivedMessage], list[Rejection]]:
     """Return at most limits.max_fused_senders messages, with at most limits.max_fused_tokens tokens; and the senders left out.
 
-    Messages with content come before empty ones, then senders in the order of their first fusion, so that new ones displace none,
-    then the nearest. The tokens of one message that exceed its share are left out in the order of their proposed confidence.
+    Messages with content come before empty ones, untrusted senders last, then senders in the order of their first fusion, so that
+    new ones displace none, then the nearest. The tokens of one message that exceed its share are left out in the order of their
+    proposed confidence.
     """
     if len(received) > limits.max_fused_senders:
         order = sorted(
             received,
             key=lambda r: (
                 _is_empty(r.message),
+                r.message.agent_id in untrusted,
                 first_fusion_ns(known, r.message.agent_id),
                 _distance_m(frame, r),
             ),

@@ -80,11 +80,14 @@ class CorrectionOutcome:
     health: PoseReport
 
     @property
+    def is_faulty(self) -> bool:
+        """Whether the prior poses of the sender have an offset or a drift."""
+        return self.health.health in _FAULTY
+
+    @property
     def untrusted(self) -> bool:
         """Whether earlier messages of the sender are excluded too."""
-        return self.use is MessageUse.INCONSISTENT or (
-            self.use is MessageUse.UNCERTAIN and self.health.health in _FAULTY
-        )
+        return self.use is MessageUse.INCONSISTENT or (self.use is MessageUse.UNCERTAIN and self.is_faulty)
 
 
 @dataclass(frozen=True)

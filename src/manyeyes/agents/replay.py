@@ -12,6 +12,7 @@ from manyeyes.agents.exchange import Exchange
 from manyeyes.agents.perception_cache import HISTORY_FRAMES, TRACK_FRAMES, AgentOutput, PerceptionCache
 from manyeyes.agents.pose_correction import PoseCorrection
 from manyeyes.agents.strategies.registry import get_strategy
+from manyeyes.agents.trust.interface import MisbehaviourDetector
 from manyeyes.comms.bandwidth import allocate_max_min_fair
 from manyeyes.comms.channel import ChannelPreset, channel_preset
 from manyeyes.comms.inbox import Inbox
@@ -38,7 +39,7 @@ class ReplayConfig:
     histories. comm_range_m: maximum distance of sender and receiver (true poses). channel_budget_bytes: bytes of all agents at one
     instant, allocated by ``comms.bandwidth.allocate_max_min_fair`` from what each agent would send without a limit, as by a central
     scheduler. send_request_map: messages with tokens carry a request map, and received request maps weight the token scores.
-    pose_correction: of received messages; None uses their prior poses.
+    pose_correction: of received messages; None uses their prior poses. misbehaviour: of all agents; None trusts every sender.
     """
 
     channel: str | ChannelPreset = "ideal"
@@ -52,6 +53,7 @@ class ReplayConfig:
     seed: int = 0
     send_request_map: bool = False
     pose_correction: PoseCorrection | None = None
+    misbehaviour: MisbehaviourDetector | None = None
 
     @property
     def radio(self) -> ChannelPreset:
@@ -186,6 +188,7 @@ class DetectionReplay:
                 PerceptionCache(self.detector, feature_cache=self.feature_cache),
                 config.pose_correction,
                 config.send_request_map,
+                misbehaviour=config.misbehaviour,
             )
         return self._agents[agent_id]
 

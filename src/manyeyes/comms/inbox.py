@@ -17,7 +17,7 @@ from manyeyes.comms.sender_table import SenderTable
 from manyeyes.comms.token_format import TokenFormat, TokenRefusal
 from manyeyes.datatypes import Message
 
-RejectionReason = TokenRefusal | Literal["content_error", "quarantined", "time", "cells", "pose", "busy"]
+RejectionReason = TokenRefusal | Literal["content_error", "quarantined", "time", "cells", "pose", "busy", "untrusted"]
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,8 @@ class Rejection:
 
     reason: as in DropCounts, or content_error: fusing it raised an error, which is the cause; quarantined: its content did so
     shortly before; time: captured too long before or after the receiver's time; pose: its pose is implausible and could not be
-    estimated; cells: more tokens in one message than are fused; busy: beyond the number of senders that are fused at one instant.
+    estimated; cells: more tokens in one message than are fused; busy: beyond the number of senders that are fused at one instant;
+    untrusted: a misbehaviour detector excludes it.
     text: what was expected, what came.
     """
 

@@ -67,7 +67,7 @@ class Engine:
 
 
 def digest_perception(perception: Perception) -> str:
-    """Return a SHA-256 of all that a perception holds: every bit of the boxes, who was fused, and who was rejected why."""
+    """Return a SHA-256 of all that a perception holds: every bit of the boxes, received and rejected senders, and all trust."""
     digest = hashlib.sha256()
     for field in fields(perception.boxes):
         digest.update(getattr(perception.boxes, field.name).detach().cpu().contiguous().numpy().tobytes())
@@ -75,6 +75,10 @@ def digest_perception(perception: Perception) -> str:
         digest.update(struct.pack("<iqi", one.message.agent_id, one.message.timestamp_ns, one.received_packets))
     for rejection in perception.rejected:
         digest.update(f"{rejection.agent_id} {rejection.reason}\n".encode())
+    for sender in () if perception.assessment is None else perception.assessment.senders:
+        digest.update(struct.pack("<idd", sender.agent_id, sender.trust, sender.weight))
+    if perception.evidence is not None:
+        digest.update(perception.evidence.kinds.numpy().tobytes())
     return digest.hexdigest()
 
 

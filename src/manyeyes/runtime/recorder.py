@@ -51,6 +51,7 @@ class RunConfig:
     security: str
     versions: dict[str, str | None]
     num_threads: int
+    misbehaviour: str | None = None
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,8 @@ class ReplayOptions:
     """Correct the poses of senders before fusion, by objects that both agents detect; leave out messages without a usable pose.
     Corrector: voting, feakm, a .safetensors file of FeaKM, or a baseline: identity, coalign, fpv-rcnn, feaco, icp, vips,
     v2x-reg-odist, v2x-reg-oiou, mash."""
+    misbehaviour: str | None = None
+    """Weigh senders by trust: ray-evidence, or a baseline: none, oracle, robosac, cp-guard; a name of your own too."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "methods", tuple(map(current_name, self.methods)))
@@ -56,6 +58,7 @@ class ReplayOptions:
         from manyeyes.agents.pose_correction import PoseCorrection
         from manyeyes.agents.replay import WARMUP_FRAMES, ReplayConfig
         from manyeyes.agents.strategies.registry import get_strategy
+        from manyeyes.agents.trust.registry import get_misbehaviour_detector
         from manyeyes.comms.channel import channel_preset
 
         channel_preset(self.channel)
@@ -78,6 +81,7 @@ class ReplayOptions:
             warmup_frames=WARMUP_FRAMES,
             seed=seed,
             pose_correction=None if self.pose_correction is None else PoseCorrection(self.pose_correction),
+            misbehaviour=None if self.misbehaviour is None else get_misbehaviour_detector(self.misbehaviour),
         )
 
 

@@ -88,6 +88,8 @@ class MethodOptions:
     """The most that a message of tokens may weigh, with its signatures."""
     pose_correction: str | None = None
     """Correct the poses of senders before fusion, by this corrector."""
+    misbehaviour: str | None = None
+    """Weigh senders by trust: ray-evidence, a baseline (none, oracle, robosac, cp-guard), or a name of your own."""
 
     def describe(self, fingerprint: bytes, security: str) -> RunConfig:
         """Return the settings as a recording holds them."""
@@ -105,6 +107,7 @@ class MethodOptions:
             security=security,
             versions=installed_versions(),
             num_threads=torch.get_num_threads(),
+            misbehaviour=self.misbehaviour,
         )
 
 
@@ -117,6 +120,7 @@ def make_agent(config: RunConfig) -> Agent:
     from manyeyes.agents.agent import Agent
     from manyeyes.agents.pose_correction import PoseCorrection
     from manyeyes.agents.strategies.registry import get_strategy
+    from manyeyes.agents.trust.registry import get_misbehaviour_detector
     from manyeyes.datatypes import CheckpointError
     from manyeyes.models import pretrained
 
@@ -126,4 +130,10 @@ def make_agent(config: RunConfig) -> Agent:
             f"Weights {config.weights} are {detector.fingerprint.hex()}; the run had {config.fingerprint}: use the same."
         )
     correction = None if config.pose_correction is None else PoseCorrection(config.pose_correction)
-    return Agent(detector, get_strategy(config.strategy), budget_bytes=config.budget_bytes, pose_correction=correction)
+    return Agent(
+        detector,
+        get_strategy(config.strategy),
+        budget_bytes=config.budget_bytes,
+        pose_correction=correction,
+        misbehaviour=None if config.misbehaviour is None else get_misbehaviour_detector(config.misbehaviour),
+    )
