@@ -25,13 +25,6 @@ from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
-from benchmarks.landmark_scenes import (
-    BoxNoise,
-    LandmarkScene,
-    LandmarkSpec,
-    make_landmark_scene,
-    relative_pose,
-)
 from benchmarks.multi_frame import TimedLandmarks, accumulate
 
 from manyeyes.evaluation.pose.metrics import PoseEvaluation, PoseScore, PriorNoise, evaluate_pose, summarize_evaluations
@@ -40,6 +33,9 @@ from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.pose_monitor import PoseHealth, PoseMonitorState, update_monitor
 from manyeyes.pose.registry import list_correctors, load_corrector
 from manyeyes.pose.types import PoseCorrector, PoseStatus
+from manyeyes.simulator.fleet.landmark_errors import BoxNoise
+from manyeyes.simulator.fleet.landmark_traffic import relative_pose
+from manyeyes.simulator.fleet.landmarks import LandmarkScene, LandmarkSpec, make_landmark_scene
 from manyeyes.studies.provenance import write_json
 
 NOISY = BoxNoise(0.45, np.radians(4.0), 0.10, 0.3)

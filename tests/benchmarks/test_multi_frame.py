@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
-from benchmarks.landmark_scenes import LandmarkSpec, make_landmark_scene
 from benchmarks.multi_frame import TimedLandmarks, accumulate
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.pose.corrector import correct_by_voting
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.types import PoseStatus, pose_difference
+from manyeyes.simulator.fleet.landmarks import LandmarkSpec, make_landmark_scene
 
 
 def test_an_earlier_landmark_moves_with_its_agent_and_its_sigma_grows():

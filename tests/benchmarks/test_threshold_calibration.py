@@ -2,12 +2,12 @@
 from dataclasses import replace
 
 import pytest
-from benchmarks.landmark_scenes import LandmarkSpec, make_landmark_scene
 from benchmarks.threshold_calibration import calibrate_acceptance
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.pose.corrector import AcceptanceTest, CorrectorConfig, correct_by_voting
 from manyeyes.pose.landmarks import Landmarks
+from manyeyes.simulator.fleet.landmarks import LandmarkSpec, make_landmark_scene
 
 
 def null_scenes(count):

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from benchmarks.landmark_scenes import BoxNoise, LandmarkSpec, make_landmark_scene
 
 from manyeyes.agents.agent import Agent
 from manyeyes.agents.strategies.registry import get_strategy, list_strategies
@@ -32,6 +31,8 @@ from manyeyes.models.detector.presets import COSTR_TINY
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.registry import list_correctors, load_corrector
 from manyeyes.pose.types import PosePrior
+from manyeyes.simulator.fleet.landmark_errors import BoxNoise
+from manyeyes.simulator.fleet.landmarks import LandmarkSpec, make_landmark_scene
 from manyeyes.training.detector.samples import AugmentConfig
 from manyeyes.training.detector.task import DetectorTask, DetectorTrainConfig
 from manyeyes.training.trainer import Trainer

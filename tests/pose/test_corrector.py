@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from benchmarks.landmark_scenes import LandmarkSpec, make_landmark_scene
 
 from manyeyes.datatypes import ConfigError, Transform
 from manyeyes.pose.corrector import AcceptanceTest, CorrectorConfig, correct_by_voting, fuse_estimates, rank_candidates
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.types import PosePrior, PoseStatus, pose_difference
 from manyeyes.pose.voting import VoteConfig, find_candidates
+from manyeyes.simulator.fleet.landmarks import LandmarkSpec, make_landmark_scene
 
 
 def transform(pose):

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
-from benchmarks.landmark_scenes import BoxNoise, LandmarkSpec, make_landmark_scene
 
 from manyeyes.datatypes import ConfigError
+from manyeyes.simulator.fleet.landmark_errors import BoxNoise
+from manyeyes.simulator.fleet.landmarks import LandmarkSpec, make_landmark_scene
 
 EXACT = BoxNoise(1e-9, 1e-9, 0.0, 1e-9)
 
