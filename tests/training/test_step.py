@@ -221,3 +221,20 @@ def test_a_step_of_a_detector_of_several_classes_trains_every_heat_map(toy):
     for head in (model.head, model.refine):
         gradient = head.out.bias.grad
         assert gradient is not None and bool((gradient[BOX_LAYOUT.total :] != 0).all())
+
+
+def test_collaborators_compress_what_the_ego_receives_and_its_own_tokens_stay(sample) -> None:
+    """Weights of ERMVP: the fused features train the sampling score, and the ego's features are those of its encoder."""
+    torch.manual_seed(0)
+    model = Detector(replace(COSTR_TINY, fusion="ermvp")).train()
+    fused, made = [], []
+    model.fusion.register_forward_hook(lambda _, given, result: (fused.append(given[0]), made.append(result))[0])
+    out = forward(model, [sample])
+    own, shared = fused[0].sender == 0, out.shared_tokens
+    is_ego = shared.sites.batch == 0
+    channels = model.encoder.out_channels
+    assert torch.equal(fused[0].features[own], shared.features[is_ego, :channels])
+    received = fused[0].sender == 1
+    assert len(fused[0].features[received].detach().unique(dim=0)) <= 0.3 * int(received.sum()) + 1
+    (made[0].bev.features ** 3).sum().backward()
+    assert bool(model.fusion.compression.scoring.weight.grad.abs().sum() > 0)

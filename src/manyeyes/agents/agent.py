@@ -29,12 +29,14 @@ from manyeyes.agents.strategies.redundancy import novelty_score
 from manyeyes.agents.strategies.registry import FusionStrategy
 from manyeyes.agents.strategies.request_maps import make_request_map
 from manyeyes.agents.token_codec import (
+    compress_tokens,
     decode_tokens,
     default_token_encoding,
+    encode_tokens,
     has_token_history,
     make_token_format,
     pack_tokens,
-    quantise_tokens,
+    require_clusters,
     require_codebook,
     unpack_tokens,
 )
@@ -137,6 +139,8 @@ class Agent:
         self.token_format = make_token_format(detector)
         if token_encoding == "codebook":
             require_codebook(detector)
+        if token_encoding == "clusters":
+            require_clusters(detector)
 
     def share(
         self,
@@ -173,11 +177,18 @@ class Agent:
             mtu=mtu,
             tables=self.token_format.tables,
             counts=selected.counts,
+            own_bytes=self._own_bytes,
         )
         packets = wire.make_packets(message, bodies)
         self.strategy.record_sent(self.perception_cache, frame, kept)
         num_bytes = sum(len(packet) + envelope.packet_bytes for packet in packets)
         return [] if budget is not None and num_bytes > budget else packets
+
+    @property
+    def _own_bytes(self) -> int:
+        """Last bytes of a row of clusters, which are the token's own; 0 of other encodings."""
+        form = self.token_format.cluster_form
+        return 0 if form is None or self.token_encoding != "clusters" else form[1]
 
     def _compose(self, frame: AgentFrame, requests: Sequence[Message]) -> Message | None:
         """Return the message of the strategy, with the local map, descriptors and request map that the agent adds."""
@@ -199,15 +210,14 @@ class Agent:
     ) -> tuple[Message, SelectedTokens]:
         """Return the message with the tokens that fit into a budget, as the detector made them, and them as they are encoded."""
         detector = self.perception_cache.detector
-        packed = pack_tokens(tokens, detector)
+        packed = pack_tokens(compress_tokens(tokens, detector), detector)
         packed = packed.with_features(self.token_format.clamp(packed.features))
         tokens = unpack_tokens(packed, detector)
-        is_coded, tables = self.token_encoding == "codebook", self.token_format.tables
-        encoded = quantise_tokens(packed, detector) if is_coded else packed
+        encoded, tables = encode_tokens(packed, detector, self.token_encoding), self.token_format.tables
         score = torch.ones(len(tokens.sites)) if message.token_score is None else message.token_score
         mtu = wire.DEFAULT_MTU - envelope.max_bytes - count_agent_body_bytes(message.body)
         selected = select_for_packets(
-            encoded, score, budget_bytes, self.token_encoding, mtu, tables, envelope.packet_bytes
+            encoded, score, budget_bytes, self.token_encoding, mtu, tables, envelope.packet_bytes, self._own_bytes
         )
         if selected.tokens is not encoded:
             tokens = tokens.keep(torch.isin(tokens.sites.key, selected.tokens.sites.key))

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import torch
+
 from manyeyes.comms.entropy import CodeTables
 from manyeyes.comms.inbox import ReceivedMessage, Rejection, token_rejection
 from manyeyes.comms.token_format import TokenFormat
@@ -24,8 +26,16 @@ def require_codebook(detector: BoxDetector) -> Codebook:
     return codebook
 
 
+def require_clusters(detector: BoxDetector) -> None:
+    """Check that a detector sends clusters; ConfigError otherwise."""
+    if getattr(detector, "cluster_form", None) is None:
+        raise ConfigError("These weights make no clusters of tokens, as those of the fusion ermvp do: use float16.")
+
+
 def default_token_encoding(detector: BoxDetector) -> TokenEncoding:
-    """Return the default token encoding: codebook if the weights have one (a tenth of the bytes), else float16."""
+    """Return the default token encoding: clusters if the weights make them, codebook if they have one, else float16."""
+    if getattr(detector, "cluster_form", None) is not None:
+        return "clusters"
     return "codebook" if has_tokens(detector) and detector.codebook is not None else "float16"
 
 
@@ -37,7 +47,17 @@ def make_token_format(detector: BoxDetector) -> TokenFormat:
     tables = None if codebook is None else CodeTables(detector.fingerprint, codebook.frequencies.cpu().numpy())
     peaks = getattr(detector, "token_peaks", None)
     channels = getattr(detector, "packed_channels", detector.token_channels)
-    return TokenFormat(detector.fingerprint, detector.token_grid, channels, tables, peaks)
+    clusters = getattr(detector, "cluster_form", None)
+    return TokenFormat(detector.fingerprint, detector.token_grid, channels, tables, peaks, clusters)
+
+
+def compress_tokens(tokens: SparseBev, detector: BoxDetector) -> SparseBev:
+    """Return shared tokens (N, C + PROPOSAL) as the fusion of the weights compresses them before they are sent."""
+    compress = getattr(detector, "compress_tokens", None)
+    if compress is None:
+        return tokens
+    with torch.inference_mode():
+        return compress(tokens)
 
 
 def pack_tokens(tokens: SparseBev, detector: BoxDetector) -> SparseBev:
@@ -62,6 +82,16 @@ def quantise_tokens(tokens: SparseBev, detector: BoxDetector) -> SparseBev:
     return tokens.with_features(require_codebook(detector).encode(tokens.features))
 
 
+def encode_tokens(packed: SparseBev, detector: BoxDetector, encoding: TokenEncoding) -> SparseBev:
+    """Return packed tokens as rows of an encoding: of bytes for codebook and clusters, as they are otherwise."""
+    if encoding == "codebook":
+        return quantise_tokens(packed, detector)
+    if encoding == "clusters":
+        require_clusters(detector)
+        return packed.with_features(detector.encode_clusters(packed.features))  # pyright: ignore[reportAttributeAccessIssue]
+    return packed
+
+
 def decode_tokens(
     received: ReceivedMessage, detector: BoxDetector, token_format: TokenFormat
 ) -> tuple[ReceivedMessage, Rejection | None]:
@@ -72,6 +102,13 @@ def decode_tokens(
         return received, None
     if codebook is not None and not tokens.features.is_floating_point() and tokens.features.shape[1] == codebook.width:
         tokens = tokens.with_features(codebook.decode(tokens.features))
+    form = token_format.cluster_form
+    if (
+        form is not None
+        and not tokens.features.is_floating_point()
+        and tokens.features.shape[1] == 2 * form[0] + form[1]
+    ):
+        tokens = tokens.with_features(detector.decode_clusters(tokens.features))  # pyright: ignore[reportAttributeAccessIssue]
     is_other_model = message.fingerprint != token_format.fingerprint
     reason = "wrong_model" if is_other_model else token_format.check_tokens(tokens)
     if reason is not None:

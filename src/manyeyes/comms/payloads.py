@@ -20,15 +20,23 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from manyeyes.comms import primitives
+from manyeyes.comms.cluster_payload import (
+    HEAD_BYTES,
+    count_fitting_clustered_cells,
+    join_clustered,
+    order_by_cluster,
+    pack_clustered,
+    read_clustered,
+)
 from manyeyes.comms.entropy import MAX_CODED_CELLS, CodeTables, count_fitting_coded_cells, pack_coded, unpack_coded
 from manyeyes.comms.map_payload import ElementRows, read_elements
 from manyeyes.comms.primitives import PacketError
 from manyeyes.datatypes import LABELS, BevGrid, Boxes, ConfigError, PointCloud, Sites, SparseBev, WireError
 from manyeyes.datatypes.message import DESCRIPTOR_DIM, RequestMap
 
-TokenEncoding = Literal["float32", "float16", "int8", "codebook"]
+TokenEncoding = Literal["float32", "float16", "int8", "codebook", "clusters"]
 
-TOKEN_ENCODINGS: tuple[TokenEncoding, ...] = ("float32", "float16", "int8", "codebook")
+TOKEN_ENCODINGS: tuple[TokenEncoding, ...] = ("float32", "float16", "int8", "codebook", "clusters")
 # The middle of what drives in European cities.
 LABEL_HEIGHTS = (1.6, 2.3, 3.2, 3.2, 1.7, 1.7, 1.6)
 NONE, TOKENS, OBJECTS, POINTS, REQUEST, ELEMENTS = range(6)
@@ -44,8 +52,9 @@ _FEATURE_TYPES: dict[TokenEncoding, np.dtype[Any]] = {
     "float16": np.dtype("<f2"),
     "int8": np.dtype("i1"),
     "codebook": np.dtype("u1"),
+    "clusters": np.dtype("u1"),
 }
-_CODED = 2
+_CODED, _CLUSTERED = 2, 1 << 4
 _MAX_CELLS = 1 << 24
 _SIGMA_XY, _SIGMA_YAW = (0.01, 20.0), (0.001, 3.2)
 
@@ -54,6 +63,8 @@ _SIGMA_XY, _SIGMA_YAW = (0.01, 20.0), (0.001, 3.2)
 class TokenRows:
     """Some cells of a grid: key (n,) ascending; scales and values: the bytes of C scale codes (none but for int8) and n rows
     of C.
+
+    Of clusters, scales are the rows of the clusters, C float16 each, and values n rows of the number of a cluster and own_bytes.
     """
 
     grid: BevGrid
@@ -62,10 +73,21 @@ class TokenRows:
     key: NDArray[np.int64]
     scales: bytes
     values: bytes
+    own_bytes: int = 0
+
+    @property
+    def form(self) -> tuple[BevGrid, TokenEncoding, int, int]:
+        """What the packets of one message have in common."""
+        return self.grid, self.encoding, self.channels, self.own_bytes
+
+    @property
+    def width(self) -> int:
+        """Number of values of a row of ``features``."""
+        return 2 * self.channels + self.own_bytes if self.encoding == "clusters" else self.channels
 
     @property
     def features(self) -> NDArray[Any]:
-        """(n, C) float32, what the values stand for; uint8 where they are codes."""
+        """(n, C) float32, what the values stand for; uint8 where they are codes or of clusters."""
         return _features([self])
 
 
@@ -184,24 +206,44 @@ def token_order(tokens: SparseBev, score: Tensor | None) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class TokenCodec:
-    """Token encoding, and entropy coding tables of codes; None sends their bytes uncoded."""
+    """Token encoding, and entropy coding tables of codes; None sends their bytes uncoded.
+
+    own_bytes: last bytes of a row of clusters, which are the token's own.
+    """
 
     encoding: TokenEncoding
     tables: CodeTables | None = None
+    own_bytes: int = 0
 
     def __post_init__(self) -> None:
         if self.encoding not in TOKEN_ENCODINGS:
             raise ConfigError(f"token encoding is one of {', '.join(TOKEN_ENCODINGS)}; got {self.encoding!r}.")
 
+    def order(self, tokens: SparseBev, score: Tensor | None) -> NDArray[np.int64]:
+        """Return (N,) rows of tokens in the order in which they are sent: by falling score, of clusters cluster by cluster."""
+        order = token_order(tokens, score)
+        if self.encoding != "clusters" or tokens.features.dtype != torch.uint8:
+            return order
+        return order_by_cluster(tokens.features.cpu().numpy(), self.own_bytes, order)
+
+    def count_channels(self, tokens: SparseBev) -> int:
+        """Return the number of channels of a row as it is sent; of clusters, that of the float16 channels."""
+        width = tokens.features.shape[1]
+        if self.encoding != "clusters":
+            return width
+        if width <= self.own_bytes or (width - self.own_bytes) % 2:
+            raise WireError(f"A row of {width} bytes is not one of float16 and {self.own_bytes} own bytes.")
+        return (width - self.own_bytes) // 2
+
     def select_tables(self, tokens: SparseBev) -> CodeTables | None:
         """Return the tables, where these tokens are to be coded by them; tokens of another encoding are a WireError."""
         codes = tokens.features.dtype == torch.uint8
-        if codes != (self.encoding == "codebook"):
+        if codes != (self.encoding in ("codebook", "clusters")):
             raise WireError(
                 f"Tokens of {tokens.features.dtype} are not sent as {self.encoding}: codes are uint8 rows of the model's "
-                "codebook, and only codes are."
+                "codebook or of clusters, and only codes are."
             )
-        if not codes or self.tables is None:
+        if self.encoding != "codebook" or self.tables is None:
             return None
         if self.tables.width != tokens.features.shape[1]:
             raise WireError(
@@ -224,9 +266,13 @@ def count_cells_per_packet(
     Bodies with header_bytes each take at most budget_bytes altogether. Each packet is filled before the next is begun,
     so a smaller budget keeps a prefix of what a larger one keeps.
     """
-    channels, encoding, tables = tokens.features.shape[1], token_codec.encoding, token_codec.select_tables(tokens)
-    bytes_per_cell = channels * _FEATURE_TYPES[encoding].itemsize
-    fixed_bytes = TOKENS_BYTES + (channels if encoding == "int8" else 0)
+    channels, encoding, tables = (
+        token_codec.count_channels(tokens),
+        token_codec.encoding,
+        token_codec.select_tables(tokens),
+    )
+    bytes_per_cell = tokens.features.shape[1] * _FEATURE_TYPES[encoding].itemsize
+    fixed_bytes = TOKENS_BYTES + (channels if encoding == "int8" else HEAD_BYTES + 1 if encoding == "clusters" else 0)
     if channels < 1 or channels > 65535 or fixed_bytes + bytes_per_cell + 5 > capacity:
         raise WireError(
             f"One cell of {channels} channels as {encoding} does not fit a body of {capacity} bytes: use a "
@@ -234,6 +280,10 @@ def count_cells_per_packet(
         )
     key = np.ascontiguousarray(tokens.sites.key.cpu().numpy()[order], np.int64)
     bytes_left = -1 if budget_bytes is None else max(0, budget_bytes)
+    if encoding == "clusters":
+        rows = tokens.features.cpu().numpy()[order]
+        limits = (TOKENS_BYTES, capacity, header_bytes, bytes_left)
+        return count_fitting_clustered_cells(key, rows, token_codec.own_bytes, *limits).tolist()
     if tables is None:
         return primitives.count_fitting_cells(
             key, bytes_per_cell, fixed_bytes, capacity, header_bytes, bytes_left
@@ -286,16 +336,16 @@ def pack_token_bodies(
 
     counts: the result of :func:`count_cells_per_packet` for these tokens, if it is known.
     """
-    order = token_order(tokens, score)
+    order = token_codec.order(tokens, score)
     key, encoding = tokens.sites.key.cpu().numpy()[order], token_codec.encoding
     features = tokens.features.detach().cpu()
-    features = features if encoding == "codebook" else features.float()
+    features = features if features.dtype == torch.uint8 else features.float()
     largest, peak = 65504 if encoding == "float16" else math.inf, 0.0
-    if features.numel() and encoding != "codebook":
+    if features.numel() and features.dtype != torch.uint8:
         peak = float(features.abs().max())
     if not (math.isfinite(peak) and peak <= largest):
         raise WireError(f"Features sent as {encoding} must be finite and at most {largest:g}; these are not.")
-    grid, channels = _GRID.pack(*_grid_fields(tokens.grid)), features.shape[1]
+    grid, channels = _GRID.pack(*_grid_fields(tokens.grid)), token_codec.count_channels(tokens)
     if counts is None:
         counts = count_cells_per_packet(tokens, order, token_codec, capacity)
     counts = list(counts) or [0]
@@ -307,8 +357,14 @@ def pack_token_bodies(
     def head(layout: int, count: int) -> bytes:
         return grid + _TOKENS.pack(number | layout << 2, channels, count)
 
+    rows, ends = features.numpy(), np.cumsum([0, *counts])
+    if encoding == "clusters":
+        number, bodies = TOKEN_ENCODINGS.index("float16") | _CLUSTERED, list[bytes]()
+        for a, b in pairwise(ends.tolist()):
+            layout, content = pack_clustered(key[a:b], rows[a:b], token_codec.own_bytes)
+            bodies.append(head(layout, b - a) + content)
+        return bodies
     if tables is not None:
-        rows, ends = features.numpy(), np.cumsum([0, *counts])
         return [
             head(_CODED, b - a) + pack_coded(key[a:b], rows[a:b], tokens.grid.shape, tables)
             for a, b in pairwise(ends.tolist())
@@ -422,6 +478,8 @@ def _read_tokens(body: bytes, fingerprint: bytes, tables: CodeTables | None) -> 
         raise PacketError("garbage", f"A tokens body begins with {TOKENS_BYTES} bytes; got {len(body)}.")
     grid, cells = _read_grid(body)
     layout_byte, channels, count = _TOKENS.unpack_from(body, _GRID.size)
+    if layout_byte & _CLUSTERED:
+        return _read_clusters(body, grid, cells)
     encoding, layout, data = TOKEN_ENCODINGS[layout_byte & 3], layout_byte >> 2, body[TOKENS_BYTES:]
     if layout > (_CODED if encoding == "codebook" else primitives.BITMAP) or not channels:
         raise PacketError("garbage", f"Unknown form of tokens: {layout_byte:#04x}, {channels} channels.")
@@ -448,6 +506,17 @@ def _read_tokens(body: bytes, fingerprint: bytes, tables: CodeTables | None) -> 
     return TokenRows(grid, encoding, channels, key, data[used:end], data[end:])
 
 
+def _read_clusters(body: bytes, grid: BevGrid, cells: int) -> TokenRows:
+    layout_byte, channels, count = _TOKENS.unpack_from(body, _GRID.size)
+    encoding, layout = TOKEN_ENCODINGS[layout_byte & 3], (layout_byte & ~_CLUSTERED) >> 2
+    if encoding != "float16" or layout > primitives.BITMAP or not channels:
+        raise PacketError("garbage", f"Unknown form of clusters: {layout_byte:#04x}, {channels} channels.")
+    key, table, tokens, own_bytes = read_clustered(layout, body[TOKENS_BYTES:], count, channels)
+    if count and int(key[-1]) >= cells:
+        raise PacketError("implausible", f"Cells lie outside a grid of {grid.shape} rows and columns.")
+    return TokenRows(grid, "clusters", channels, key, table, tokens, own_bytes)
+
+
 def merge_tokens(parts: list[TokenRows]) -> SparseBev | None:
     """Return the cells of several packets, all of one form, as one set, by key; None of none."""
     if not parts:
@@ -459,7 +528,9 @@ def merge_tokens(parts: list[TokenRows]) -> SparseBev | None:
 
 
 def _features(parts: list[TokenRows]) -> NDArray[Any]:
-    """Return (n, C) float32, or uint8 of codes, of the rows of several packets of one form."""
+    """Return (n, C) float32, or uint8 of codes and of clusters, of the rows of several packets of one form."""
+    if parts[0].encoding == "clusters":
+        return np.concatenate([join_clustered(p.scales, p.values, p.channels, p.own_bytes) for p in parts])
     dtype, channels = _FEATURE_TYPES[parts[0].encoding], parts[0].channels
     # A copy that may be written to, in the machine's own order of bytes.
     values = np.frombuffer(b"".join(p.values for p in parts), dtype).astype(dtype.newbyteorder("="))

@@ -253,8 +253,9 @@ def _measure(fragment: Fragment, held: HeldMessage | None) -> _Amount:
     """Measure the content of a packet."""
     body, memory = fragment.body, _PACKET_BYTES + len(fragment.packet)
     if isinstance(body, TokenRows):
-        count, is_code = len(body.key), body.encoding == "codebook"
-        memory += len(body.values) + count * (16 + body.channels * (_BYTES_PER_CODE_BYTE if is_code else 4))
+        count, is_code = len(body.key), body.encoding in ("codebook", "clusters")
+        memory += len(body.scales) + len(body.values)
+        memory += count * (16 + body.width * (_BYTES_PER_CODE_BYTE if is_code else 4))
         if held is None or "cells" not in held.counts:
             memory += count_bitmap_bytes(body.grid)
         return _Amount("cells", count, memory)

@@ -38,7 +38,8 @@ class TokenFormat:
 
     fingerprint: 8 bytes that name the weights. grid: the lattice of the tokens. channels: of a row of floats. tables: of the
     codebook, whose rows of codes are read by them; None where the weights have none. peaks: of each channel's magnitude in
-    training; None bounds all channels by MAX_TOKEN_VALUE. max_values: (channels,) bounds that follow from them.
+    training; None bounds all channels by MAX_TOKEN_VALUE. cluster_form: channels of a row of a cluster and own bytes of a token,
+    where the weights make clusters. max_values: (channels,) bounds that follow from the peaks.
     """
 
     fingerprint: bytes
@@ -46,6 +47,7 @@ class TokenFormat:
     channels: int
     tables: CodeTables | None = None
     peaks: tuple[float, ...] | None = None
+    cluster_form: tuple[int, int] | None = None
     max_values: NDArray[np.float32] = field(init=False, repr=False)
     _bounds: dict[TokenEncoding, NDArray[np.int64]] = field(init=False, repr=False)
 
@@ -63,7 +65,8 @@ class TokenFormat:
             return "grid"
         if rows.encoding == "codebook":
             return None if self.tables is not None and rows.channels == self.tables.width else "width"
-        if rows.channels != self.channels:
+        is_clustered = rows.encoding == "clusters"
+        if (rows.channels, rows.own_bytes) != (self.cluster_form if is_clustered else (self.channels, 0)):
             return "width"
         return None if self._is_within_range(rows) else "value"
 
@@ -72,6 +75,9 @@ class TokenFormat:
         if rows.encoding == "int8":
             codes = np.frombuffer(rows.scales, np.uint8)
             return bool(primitives.are_steps_within(values, codes, self._bounds["int8"]))
+        if rows.encoding == "clusters":
+            table = np.frombuffer(rows.scales, np.uint8)
+            return bool(primitives.are_floats_within(table, 2, self._bounds["float16"][: rows.channels]))
         size = 4 if rows.encoding == "float32" else 2
         return bool(primitives.are_floats_within(values, size, self._bounds[rows.encoding]))
 

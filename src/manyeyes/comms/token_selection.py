@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from manyeyes.comms.entropy import CodeTables
-from manyeyes.comms.payloads import TokenCodec, TokenEncoding, count_cells_per_packet, token_order
+from manyeyes.comms.payloads import TokenCodec, TokenEncoding, count_cells_per_packet
 from manyeyes.comms.wire import DEFAULT_MTU, HEADER_BYTES
 from manyeyes.datatypes import SparseBev
 
@@ -31,16 +31,18 @@ def select_for_packets(
     mtu: int = DEFAULT_MTU,
     tables: CodeTables | None = None,
     envelope_bytes: int = 0,
+    own_bytes: int = 0,
 ) -> SelectedTokens:
     """Return the cells of highest score (N,), ties by key, whose packets together have at most budget_bytes; None is no limit.
 
     Header, cell indices, scales and checksums are counted, so that the packets that ``wire.encode_tokens`` makes of the result
     never exceed the budget. A smaller budget keeps a subset. A budget that holds no cell keeps none: then the section is left
     out of the message (an empty section would still cost its header). envelope_bytes: added to each packet by its signature; the
-    budget includes them, mtu does not. Source: CoSTr Eq. 13 with real bytes.
+    budget includes them, mtu does not. Clusters (``cluster_payload``) are taken one after another, by the highest score of their
+    tokens; own_bytes: last bytes of a row of clusters, which are the token's own. Source: CoSTr Eq. 13 with real bytes.
     """
-    token_codec = TokenCodec(token_encoding, tables)
-    order = token_order(bev, score)
+    token_codec = TokenCodec(token_encoding, tables, own_bytes)
+    order = token_codec.order(bev, score)
     counts = count_cells_per_packet(
         bev, order, token_codec, mtu - HEADER_BYTES, HEADER_BYTES + envelope_bytes, budget_bytes
     )

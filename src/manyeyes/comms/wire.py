@@ -46,7 +46,8 @@ Tokens (kind 1), some cells of one grid with their features:
 12     2     u16      pillar, millimetres
 14     1     u8       stride
 15     1     u8       bits 0-1 features (0 float32, 1 float16, 2 int8, 3 codes), bits 2-3 layout (0 cells as gaps,
-                      1 cells as a bitmap, 2 cells and codes as one coded stream), 4-7 zero
+                      1 cells as a bitmap, 2 cells and codes as one coded stream), bit 4 clusters, of float16 in
+                      layouts 0 and 1 only, 5-7 zero
 16     2     u16      channels C; bytes of a row of codes
 18     2     u16      cells n; 0 only where the message's whole section is empty
 20     ...            layouts 0, 1: cells, in ascending order of ``row * columns + column``, by ``primitives.pack_cells``
@@ -54,6 +55,11 @@ Tokens (kind 1), some cells of one grid with their features:
 ...    ...            layouts 0, 1: features, n rows of C
 20     ...            layout 2, codes only: both, by ``entropy.pack_coded`` and the tables of the model's codebook
 ====== ===== ======== =====================================================================================
+
+With bit 4, tokens of a cluster have equal features, which stand in the packet once. Then, from byte 20: u8 clusters K, 1 to 255,
+0 only without cells; u8 bytes W of a token's own; the cells; K rows of C float16; n times u8 number of the token's cluster and W
+bytes. Each packet has the clusters of its tokens, in the order of their first tokens, all of them used. Bit 4 came after version 4:
+a reader that does not know it refuses the packet as garbage and uses the other sections.
 
 Objects (kind 2): one byte of flags (bit 0 velocities, bit 1 descriptors, 2-7 zero, the same in all packets), then 14 bytes
 each, in the sender's frame, highest score first:
@@ -183,12 +189,14 @@ def encode(
     token_encoding: TokenEncoding = "float16",
     mtu: int = DEFAULT_MTU,
     tables: CodeTables | None = None,
+    own_bytes: int = 0,
 ) -> list[bytes]:
     """Return a message as packets of at most mtu bytes, the most important first; what does not fit the format is a WireError.
 
-    tables: those of the weights that the message names; with them, codes are entropy-coded.
+    tables: those of the weights that the message names; with them, codes are entropy-coded. own_bytes: last bytes of a row of
+    clusters, which are the token's own.
     """
-    tokens = encode_tokens(message, token_encoding=token_encoding, mtu=mtu, tables=tables)
+    tokens = encode_tokens(message, token_encoding=token_encoding, mtu=mtu, tables=tables, own_bytes=own_bytes)
     return make_packets(message, [*encode_other_sections(message, mtu), *tokens])
 
 
@@ -213,12 +221,13 @@ def encode_tokens(
     mtu: int = DEFAULT_MTU,
     tables: CodeTables | None = None,
     counts: Sequence[int] | None = None,
+    own_bytes: int = 0,
 ) -> list[EncodedBody]:
     """Return the tokens of a message as the bodies of packets, none without tokens; arguments and errors as in :func:`encode`.
 
     counts: how many tokens each packet takes, where ``token_selection.select_for_packets`` has counted them.
     """
-    token_codec, capacity = TokenCodec(token_encoding, tables), _body_capacity(mtu, message)
+    token_codec, capacity = TokenCodec(token_encoding, tables, own_bytes), _body_capacity(mtu, message)
     if message.tokens is None:
         return []
     if tables is not None and tables.fingerprint != message.fingerprint:
@@ -469,7 +478,7 @@ class Assembly:
     def __init__(self, first: Fragment) -> None:
         self.header = first.header
         self.fragments: dict[int, Fragment] = {}
-        self._token_layout: tuple[BevGrid, TokenEncoding, int] | None = None
+        self._token_layout: tuple[BevGrid, TokenEncoding, int, int] | None = None
         self._objects: np.dtype[Any] | None = None
         self._has_request = False
         self._rings: bytes | None = None
@@ -495,7 +504,7 @@ class Assembly:
             name = self._name(fragment)
             raise PacketError("contradiction", f"A second {name} differs from the first; both cannot be true.")
         if isinstance(fragment.body, TokenRows):
-            form = (fragment.body.grid, fragment.body.encoding, fragment.body.channels)
+            form = fragment.body.form
             if self._token_layout is None:
                 self._cells = np.zeros(count_bitmap_bytes(fragment.body.grid), np.uint8)
             if (self._token_layout or form) != form or not primitives.mark_new(self._cells, fragment.body.key):

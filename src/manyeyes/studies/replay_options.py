@@ -38,9 +38,9 @@ class ReplayOptions:
     """How long an ego waits for messages after its own sweep; by default 0 on the ideal channel, else one period, 100."""
     budget_bytes: ByteCount = 1 << 17
     """The most that a message of tokens may weigh."""
-    token_encoding: Literal["float32", "float16", "int8", "codebook"] | None = None
-    """How tokens are written: their features as numbers, or all of them as the codes of the weights' codebook; by default as
-    codes where the weights have one, else as float16."""
+    token_encoding: Literal["float32", "float16", "int8", "codebook", "clusters"] | None = None
+    """How tokens are written: their features as numbers, all of them as the codes of the weights' codebook, or one row a cluster
+    (fusion ermvp); by default as clusters or codes where the weights have them, else as float16."""
     request_maps: bool = False
     """Send request maps with token messages, and weight tokens by the latest received ones (Where2comm)."""
     pose_correction: str | None = None

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from manyeyes._bounds import ChannelCount, FiniteFloat
 from manyeyes.datatypes import VEHICLES, BevGrid, Boxes, ConfigError, PointCloud, SparseBev
 from manyeyes.models.detector.box_head import BoxHead, DecodeConfig, RawBoxes, RefineHead, decode
+from manyeyes.models.detector.cluster_rows import count_own_bytes, decode_cluster_rows, encode_cluster_rows
 from manyeyes.models.detector.codebook import Codebook, CodebookConfig
 from manyeyes.models.detector.encoder import EncoderConfig, SparseEncoder
 from manyeyes.models.detector.pillars import PillarEncoder, PillarKind
@@ -19,6 +20,7 @@ from manyeyes.models.detector.proposal import NO_HEAT_LOGIT, PROPOSAL_DIM, make_
 from manyeyes.models.detector.pruning import FocalPrune, PruneOutput
 from manyeyes.models.detector.selector import Selector
 from manyeyes.models.detector.transformer import AttentionConfig, WindowTransformer
+from manyeyes.models.fusion.clusters import ClusterCompression
 from manyeyes.models.fusion.registry import get_fusion
 from manyeyes.models.fusion.token_merge import FusedBev
 from manyeyes.models.fusion.transform_tokens import Tokens
@@ -180,6 +182,43 @@ class Detector(nn.Module):
         channels, rows = self.encoder.out_channels, tokens.features
         heat = rows[:, channels] if self._sends_confidence else rows.new_full((len(rows),), NO_HEAT_LOGIT)
         return tokens.with_features(torch.cat((rows[:, :channels], make_bare_proposals(heat)), 1))
+
+    @property
+    def cluster_form(self) -> tuple[int, int] | None:
+        """Channels of a row of a cluster and bytes of a token's own, where the fusion sends clusters; None otherwise."""
+        sends_clusters = isinstance(getattr(self.fusion, "compression", None), ClusterCompression)
+        return (self.encoder.out_channels, count_own_bytes(self.is_bare)) if sends_clusters else None
+
+    def compress_tokens(self, tokens: SparseBev) -> SparseBev:
+        """Return the shared tokens (N, token_channels) of each message of a batch as their senders compress them."""
+        compression = getattr(self.fusion, "compression", None)
+        if compression is None or not len(tokens.sites):
+            return tokens
+        channels, given = self.encoder.out_channels, tokens.features
+        rows = given.to(self.device)
+        sizes = torch.bincount(tokens.sites.batch, minlength=tokens.sites.batch_size).tolist()
+        parts = [compression(part).features for part in rows[:, :channels].split(sizes)]
+        return tokens.with_features(torch.cat((torch.cat(parts), rows[:, channels:]), 1).to(given.device))
+
+    def score_for_sampling(self, tokens: SparseBev) -> Tensor:
+        """Return the learned score (N,) in (0, 1) by which a fusion that sends clusters samples shared tokens.
+
+        Raises:
+            ConfigError: the fusion makes no clusters.
+        """
+        compression = getattr(self.fusion, "compression", None)
+        if not isinstance(compression, ClusterCompression):
+            raise ConfigError(f"fusion {self.config.fusion} has no sampling score; ermvp has one.")
+        features = tokens.features[:, : self.encoder.out_channels]
+        return compression.score(features.to(self.device)).to(features.device)
+
+    def encode_clusters(self, tokens: Tensor) -> Tensor:
+        """Encode packed tokens (N, packed_channels) to rows of bytes (N, 2 C + own bytes), equal within a cluster."""
+        return encode_cluster_rows(tokens, self.is_bare)
+
+    def decode_clusters(self, rows: Tensor) -> Tensor:
+        """Invert encode_clusters, up to float16 and the steps of proposal codes."""
+        return decode_cluster_rows(rows, self.is_bare)
 
     def score_tokens(self, tokens: SparseBev) -> Tensor:
         """Return importance logits (N,) of the tokens; under a budget the highest are sent."""

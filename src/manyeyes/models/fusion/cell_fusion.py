@@ -36,6 +36,11 @@ class RuleFusion(nn.Module):
         self.encoding, self.merge = SpatioTemporalEncoding(channels), TokenMerge(channels, "softmax")
         self.rule = rule
 
+    @property
+    def compression(self) -> nn.Module | None:
+        """What the sender does with its features, if anything (``clusters``)."""
+        return getattr(self.rule, "compression", None)
+
     def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
         """Fuse the tokens of all agents to one feature and one box per cell; past is ignored."""
         key, place = assign_cells(tokens)
@@ -57,6 +62,11 @@ class BareFusion(nn.Module):
     def __init__(self, rule: nn.Module) -> None:
         super().__init__()
         self.rule, self.sends_confidence = rule, bool(getattr(rule, "sends_confidence", False))
+
+    @property
+    def compression(self) -> nn.Module | None:
+        """What the sender does with its features, if anything (``clusters``)."""
+        return getattr(self.rule, "compression", None)
 
     def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
         """Fuse the tokens of all agents to one feature per cell; past is ignored, and merged proposals are zero."""

@@ -2,8 +2,8 @@
 """ERMVP's fusion (Zhang et al., CVPR 2024): attention over all agents in windows, local and with a global query, then the mean.
 
 Positions in windows are sines instead of a learned three-dimensional bias. There are three layers as in the paper, and no drop-out.
-Its compression, clusters of sampled features, needs a wire section of its own and is not part of it; its correction of poses is the
-corrector ``feaco``.
+Its compression is that of the sender: clusters of features (``clusters``), which stand in a packet once
+(``comms.cluster_payload``); proposals are sent for each token. Its correction of poses is the corrector ``feaco``.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from manyeyes.datatypes import ConfigError
 from manyeyes.models.detector.transformer import AttentionConfig
 from manyeyes.models.fusion.by_cell import AbsentSenders, CellRows
 from manyeyes.models.fusion.cell_fusion import register_rule
+from manyeyes.models.fusion.clusters import ClusterCompression
 from manyeyes.ops.voxelize import segment_mean
 from manyeyes.ops.window_attention import plan_windows, sincos_encoding, window_attention
 
@@ -96,6 +97,7 @@ class Ermvp(nn.Module):
         if channels % attention.heads:
             raise ConfigError(f"ERMVP needs channels divisible by heads; got {channels} and {attention.heads}.")
         self.absent: AbsentSenders = absent
+        self.compression = ClusterCompression(channels)
         self.layers = nn.ModuleList(ErmvpLayer(channels, attention) for _ in range(DEPTH))
         self.norm, self.out = nn.LayerNorm(channels), nn.Linear(channels, channels)
 

@@ -38,7 +38,7 @@ from manyeyes.viz.study_table import (
 from manyeyes.viz.table import LOG2_BYTES
 
 BUDGETS = (1398, 2796, 4096, 8192, 16384, 32768, 65536, 131072)
-UNLIMITED, REFERENCE_ENCODING, CODEBOOK = "references", "float32", "codebook"
+UNLIMITED, REFERENCE_ENCODING, CODEBOOK, CLUSTERS = "references", "float32", "codebook", "clusters"
 THREE_PACKETS_BYTES, MIN_COMPRESSION_RATIO = 4096, 4.7
 
 
@@ -90,12 +90,13 @@ def run(options: BandwidthOptions, context: StudyContext) -> None:
 
 
 def _resolve_encodings(options: BandwidthOptions) -> tuple[str, ...]:
-    """Return those asked for, or all that the weights can write: codes need a codebook."""
+    """Return those asked for, or all that the weights can write: codes need a codebook, clusters a fusion that makes them."""
     for name in options.token_encodings:
         if name not in TOKEN_ENCODINGS:
             raise ConfigError(f"Tokens are not written as {name!r}; known: {', '.join(TOKEN_ENCODINGS)}.")
-    has_codes = default_token_encoding(load_detector(options.replay_options.weights)) == CODEBOOK
-    return options.token_encodings or tuple(name for name in TOKEN_ENCODINGS if name != CODEBOOK or has_codes)
+    usual = default_token_encoding(load_detector(options.replay_options.weights))
+    of_weights = (CODEBOOK, CLUSTERS)
+    return options.token_encodings or tuple(n for n in TOKEN_ENCODINGS if n not in of_weights or n == usual)
 
 
 def _condition_name(budget: int | None, encoding: str) -> str:

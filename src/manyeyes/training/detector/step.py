@@ -90,7 +90,7 @@ def forward(model: Detector, samples: list[Sample], prune_threshold: float | Non
         for ego, sample in enumerate(samples)
         for i, view in enumerate(sample.views)
     ]
-    parts = _deliver(model.unpack_tokens(model.pack_tokens(shared)), links, score, mask)
+    parts = _deliver(_as_sent(model, shared, links), links, score, mask)
     ego_history, sender_history = (
         _history_tokens(model, samples, which, prune_threshold) for which in ("ego_history", "sender_history")
     )
@@ -130,6 +130,16 @@ def _deliver(shared: SparseBev, links: list[_Link], score: Tensor, mask: Tensor 
             masks = [None if link.is_own or link.view.max_tokens is None else part for link, part in zip(links, parts)]
     split = zip(links, features.split(sizes), xy.split(sizes), masks)
     return [_agent_tokens(link, own, place, kept) for link, own, place, kept in split]
+
+
+def _as_sent(model: Detector, shared: SparseBev, links: list[_Link]) -> SparseBev:
+    """Return the tokens of each view as they are fused: compressed by their senders, but of the egos themselves."""
+    packed = model.unpack_tokens(model.pack_tokens(shared))
+    sent = model.compress_tokens(packed)
+    if sent is packed:
+        return packed
+    is_own = torch.tensor([link.is_own for link in links], device=shared.features.device)[shared.sites.batch]
+    return packed.with_features(torch.where(is_own[:, None], packed.features, sent.features))
 
 
 def _is_complete(view: AgentView) -> bool:
@@ -181,7 +191,8 @@ def _history_tokens(
     shared = model.make_tokens(seen.tokens, model.predict(seen.tokens))
     keys = [(*samples[ego].key, _HISTORY_KEYS[which], number) for number, (ego, _) in enumerate(views)]
     links = [_Link(ego, view, key) for (ego, view), key in zip(views, keys)]
-    return _deliver(model.unpack_tokens(model.pack_tokens(shared)), links, model.score_tokens(shared), None)
+    sent = _as_sent(model, shared, links if which == "sender_history" else [replace(k, is_own=True) for k in links])
+    return _deliver(sent, links, model.score_tokens(shared), None)
 
 
 def loss_terms(
