@@ -2,6 +2,7 @@
 """Every study from end to end on a small recording, with weights that were never trained: what is written, kept and refused."""
 
 import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from manyeyes.datasets.opv2v import Opv2vRecording, Opv2vWriter
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.evaluation.detection import benchmark
 from manyeyes.evaluation.detection.accumulator import MetricAccumulator
-from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, run_scenario
+from manyeyes.evaluation.detection.benchmark import BenchmarkConfig, load_detector, run_scenario
 from manyeyes.evaluation.detection.compute_times import compute_time_s
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
@@ -134,25 +135,87 @@ def test_robustness_has_a_row_per_perturbation_and_method(data, weights, tmp_pat
     }
 
 
+@pytest.fixture(scope="module")
+def main_table(data, weights, tmp_path_factory) -> Path:
+    """The folder of a main table: both forms, a baseline inside and one bare, with and without pose correction."""
+    folder = tmp_path_factory.mktemp("table")
+    with torch.random.fork_rng():
+        torch.manual_seed(1)
+        for name in ("max", "max/bare"):
+            bare = Detector(replace(COSTR_TINY, fusion=name, codebook=None))
+            checkpoint.save(bare, folder / f"{name.replace('/', '-')}.safetensors", {})
+    baselines = (f"F-Cooper={folder}/max-bare.safetensors", f"W2C={folder}/max.safetensors@intermediate-where2comm")
+    methods = ("no-fusion", "late", "intermediate", "late-temporal", "no-fusion-temporal")
+    words = ("--frame-stride", 2, "--perturbations", "clean", "0.8 m", "--channels", "its-g5-6", "--methods", *methods)
+    common = ("--data", data, "--split", "test", "--weights", weights, "--workers", 1, "--out", folder)
+    command = ("study", "main-table", *common, *words, "--checkpoints", *baselines)
+    assert cli.main([str(word) for word in command]) == 0
+    return folder
+
+
 @pytest.mark.slow
-def test_the_main_table_judges_both_forms_at_sweep_and_answer(data, weights, tmp_path) -> None:
-    methods = ("no-fusion", "late", "late-temporal", "no-fusion-temporal")
-    words = ("--frame-stride", 2, "--perturbations", "0.8 m", "--channels", "its-g5-6", "--methods", *methods)
-    common = ("--data", data, "--split", "test", "--weights", weights, "--workers", 1, "--out", tmp_path)
-    assert cli.main([str(word) for word in ("study", "main-table", *common, *words)]) == 0
-    held = json.loads((tmp_path / "main-table.json").read_text())
-    rows = {(r["channel"], r["perturbation"]["position_sigma_m"], r["method"]): r for r in held["result"]["rows"]}
-    assert set(rows) == {
-        *(("any channel", 0.0, m) for m in methods if m.startswith("no")),
-        *(("its-g5-6", s, m) for s in (0.0, 0.8) for m in methods if m.startswith("late")),
+def test_the_main_table_judges_both_forms_at_sweep_and_answer(main_table) -> None:
+    held = json.loads((main_table / "main-table.json").read_text())
+    rows = {
+        (r["channel"], r["perturbation"]["position_sigma_m"], r["corrector"], r["method"]): r
+        for r in held["result"]["rows"]
     }
-    late, alone = rows["its-g5-6", 0.0, "late"], rows["any channel", 0.0, "no-fusion"]
+    assert set(rows) == {
+        *(("any channel", 0.0, "off", m) for m in ("no-fusion", "no-fusion-temporal")),
+        *(
+            ("its-g5-6", sigma, corrector, m)
+            for sigma in (0.0, 0.8)
+            for corrector in ("off", "voting")
+            for m in ("late", "intermediate", "late-temporal", "F-Cooper", "W2C")
+        ),
+    }
+    late, alone = rows["its-g5-6", 0.0, "off", "late"], rows["any channel", 0.0, "off", "no-fusion"]
     assert late["answer_ms"] == pytest.approx(100 + 1e3 * compute_time_s("late"))
+    assert late["compute_ms"] == 1e3 * compute_time_s("late")
     assert alone["answer_ms"] == pytest.approx(1e3 * compute_time_s("no-fusion"))
     noise = [c["config"]["pose_noise"] for c in held["provenance"]["config"]["config"]["conditions"]]
     assert {n["claim"] for n in noise if n} == {"none"} and {n["in_time"] for n in noise if n} == {"autoregressive"}
-    text = (tmp_path / "main-table.md").read_text()
+    text = (main_table / "main-table.md").read_text()
     assert "claimed covariance: none" in text and "random walk of 0.02 m" in text and "AP@0.7 at answer" in text
+    assert "duplicates/object" in text and "parameters of fusion" in text
+    descriptions = {c["description"] for c in held["result"]["comparisons"]}
+    assert "intermediate - F-Cooper, its-g5-6: 0.8 m, corrector voting" in descriptions
+    assert "intermediate - no-fusion, its-g5-6: 0.8 m" in descriptions
+    assert "intermediate, its-g5-6: 0.8 m, corrector voting - off" in descriptions
+    assert not any("temporal" in d for d in descriptions), "ours has no form with memory here"
+
+
+@pytest.mark.slow
+def test_the_main_table_states_parameters_and_both_counts_of_bytes(main_table, weights) -> None:
+    rows = {r["method"]: r for r in json.loads((main_table / "main-table.json").read_text())["result"]["rows"]}
+    whole = sum(p.numel() for p in load_detector(str(weights)).parameters())
+    fusion = sum(p.numel() for p in load_detector(str(weights)).fusion.parameters())
+    assert rows["intermediate"]["parameters"] == {"fusion": fusion, "whole": whole}
+    assert rows["F-Cooper"]["parameters"]["fusion"] == 0 == rows["late"]["parameters"]["fusion"]
+    assert rows["late"]["parameters"]["whole"] < whole - fusion
+    rules = {name: row["paper_rule"] for name, row in rows.items()}
+    assert rules == {
+        "no-fusion": "nothing", "no-fusion-temporal": "nothing", "late": "boxes", "late-temporal": "boxes",
+        "intermediate": "cells and indices", "F-Cooper": "dense map", "W2C": "cells",
+    }  # fmt: skip
+    grid, channels = load_detector(str(weights)).token_grid, load_detector(str(weights)).encoder.out_channels
+    assert rows["F-Cooper"]["paper_bytes"] == grid.shape[0] * grid.shape[1] * channels * 4
+    assert rows["no-fusion"]["paper_bytes"] == rows["no-fusion"]["bytes_per_message"] == 0
+    assert rows["intermediate"]["paper_bytes"] > rows["intermediate"]["bytes_per_message"] / 2 > 0
+
+
+@pytest.mark.slow
+def test_random_rows_are_made_again_by_their_commands(main_table, capsys) -> None:
+    path = main_table / "main-table.json"
+    assert cli.main(["report", "check-cells", str(path), "--count", "1", "--seed", "3"]) == 0
+    assert capsys.readouterr().out.count("equal") == 1
+    held = json.loads(path.read_text())
+    for row in held["result"]["rows"]:
+        row["ap"][0]["value"] += 0.001
+    (main_table / "changed.json").write_text(json.dumps(held))
+    assert cli.main(["report", "check-cells", str(main_table / "changed.json"), "--count", "1"]) == 1
+    output = capsys.readouterr()
+    assert "ap[0].value" in output.out and "1 of 1 rows differ" in output.err
 
 
 @pytest.mark.slow

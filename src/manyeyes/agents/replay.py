@@ -16,6 +16,7 @@ from manyeyes.agents.trust.interface import MisbehaviourDetector
 from manyeyes.comms.bandwidth import allocate_max_min_fair
 from manyeyes.comms.channel import ChannelPreset, channel_preset
 from manyeyes.comms.inbox import Inbox
+from manyeyes.comms.message_contents import MessageContents, count_contents
 from manyeyes.comms.wire import TokenEncoding
 from manyeyes.datasets.base import Recording, RecordingReader
 from manyeyes.datatypes import AgentFrame, Boxes, Snapshot, Transform
@@ -74,11 +75,14 @@ class ReplayConfig:
 
 @dataclass(frozen=True)
 class SentPackets:
-    """Packets that one agent sent at one instant. packet_sizes: bytes of each packet; seconds: duration of share."""
+    """Packets that one agent sent at one instant. packet_sizes: bytes of each packet; seconds: duration of share; contents: of all
+    packets together.
+    """
 
     agent_id: int
     packet_sizes: tuple[int, ...]
     seconds: float
+    contents: MessageContents = MessageContents()
 
     @property
     def num_bytes(self) -> int:
@@ -137,7 +141,7 @@ class DetectionReplay:
         frames, latency_ns = snapshot.frames, round(self.config.latency_budget_s * 1e9)
         outgoing = self._share(frames)
         sent = tuple(
-            SentPackets(frame.agent_id, tuple(map(len, packets)), took)
+            SentPackets(frame.agent_id, tuple(map(len, packets)), took, count_contents(packets))
             for frame, (packets, took) in zip(frames, outgoing)
         )
         deadlines_ns = [frame.timestamp_ns + latency_ns for frame in frames]

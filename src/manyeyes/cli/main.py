@@ -31,7 +31,7 @@ COMMANDS = {
     "live": "agents as processes on a network: run one, demo of a team, replay of a recorded run",
     "keys": "keys and certificates of agents on a network: make, issue, verify, revoke",
     "study": "reproduce a table or figure: robustness, bandwidth, pose noise, map fusion, ...",
-    "report": "documents of results: docs",
+    "report": "documents of results, and checks of them: docs, check-cells",
     "doctor": "print what a bug report needs",
 }
 COMMAND_GROUPS = {
@@ -61,10 +61,17 @@ COMMAND_GROUPS = {
         "trust": "print the anchors, issuers and revocations of a trust file",
         "demo": "make a whole federation for tests: anchor, issuer, trust file, agents",
     },
-    "report": {"docs": "write tables of README and documents from stored results, or check them"},
+    "report": {
+        "docs": "write tables of README and documents from stored results, or check them",
+        "check-cells": "make random rows of a stored table again, and compare their numbers",
+    },
     "study": {name: study.summary for name, study in STUDIES.items()},
 }
-MODULES = {"fit-codebook": "fit_codebook", "map import": "map import_predictions"}
+MODULES = {
+    "fit-codebook": "fit_codebook",
+    "map import": "map import_predictions",
+    "report check-cells": "report check_cells",
+}
 """Modules of commands whose name differs from the command."""
 INTERRUPTED_EXIT_CODE = 130
 _ENCODING_REMEDY = f"{sys.getfilesystemencoding()} of this environment: set PYTHONUTF8=1, or rename the file."

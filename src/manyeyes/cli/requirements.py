@@ -95,6 +95,7 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
     "pose": (_GICP,),
     "doctor": (),
     "report docs": (),
+    "report check-cells": (),
     "map build": (_ARROW, _SHAPELY, _MATPLOTLIB),
     "map simulate": (_ARROW, _SHAPELY),
     "map import": (_ARROW,),

@@ -431,6 +431,15 @@ def claimed_cells(packet: bytes, at: int) -> int:
     return _TOKENS.unpack_from(packet, at + _GRID.size)[2] if len(packet) >= at + TOKENS_BYTES else 0
 
 
+def count_rows(kind: int, body: bytes, has_fine_scores: bool = True) -> int:
+    """Return the number of cells, objects or points in a body of own packets, which is not checked; 0 of other kinds."""
+    if kind == TOKENS:
+        return claimed_cells(body, 0)
+    if kind == OBJECTS:
+        return (len(body) - 1) // _object_type(body[0], has_fine_scores).itemsize
+    return len(body) // _POINT.itemsize if kind == POINTS else 0
+
+
 def _rows(body: bytes, dtype: np.dtype[Any]) -> NDArray[Any]:
     if len(body) % dtype.itemsize:
         raise PacketError("garbage", f"Rows of {dtype.itemsize} bytes do not fill a body of {len(body)}.")

@@ -429,10 +429,14 @@ def read_fragment(envelope: Envelope, tables: CodeTables | None = None) -> Fragm
 
     tables: of the reader's weights, by which coded tokens are read.
     """
-    header, packet = envelope.header, envelope.packet
-    content, has_fine_scores = packet[envelope.body_at : -_CRC.size], packet[2] > VERSION_COARSE_SCORES
+    header, (content, has_fine_scores) = envelope.header, read_content(envelope)
     body = payloads.read_body(envelope.kind, content, header.fingerprint, tables, has_fine_scores)
-    return Fragment(header, envelope.number, body, packet, envelope.agent_body)
+    return Fragment(header, envelope.number, body, envelope.packet, envelope.agent_body)
+
+
+def read_content(envelope: Envelope) -> tuple[bytes, bool]:
+    """Return the bytes of a packet's body, and whether scores of its objects have two bytes."""
+    return envelope.packet[envelope.body_at : -_CRC.size], envelope.packet[2] > VERSION_COARSE_SCORES
 
 
 def decode_packet(packet: bytes, tables: CodeTables | None = None) -> Fragment:

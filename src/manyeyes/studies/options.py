@@ -69,14 +69,23 @@ class RobustnessOptions(EvaluationOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class MainTableOptions(EvaluationOptions):
-    """Options of the study main-table, whose channels take the place of --channel and --latency-budget-ms."""
+    """Options of the study main-table, whose channels and correctors take the place of --channel, --latency-budget-ms and
+    --pose-correction.
+    """
 
     replay_options: ReplayOptions = field(default_factory=lambda: ReplayOptions(methods=BOTH_FORMS))
     """How agents collaborate."""
     channels: tuple[str, ...] = ("its-g5-6", "ideal")
     """Channels, one table each; the ego waits 100 ms for messages, on the ideal one 0."""
     perturbations: tuple[str, ...] = ()
-    """Perturbations by the names of the tables, such as "0.8 m"; by default clean, 0.4 s, 0.8°, 0.8 m, 30 % loss, all together."""
+    """Perturbations by the names of the tables, such as clean "0.8 m"; by default clean, 0.4 s, 0.8°, 0.8 m, 30 % loss, all
+    together."""
+    correctors: tuple[str, ...] = ("off", "voting")
+    """Pose correctors, each with every perturbation; off: none."""
+    checkpoints: tuple[str, ...] = ()
+    """Baselines with weights of their own, as NAME=weights.safetensors[@STRATEGY[@CORRECTOR]], in the forms of intermediate."""
+    rows: tuple[str, ...] = ()
+    """Only these rows, by the names of methods and baselines."""
 
 
 @dataclass(frozen=True, kw_only=True)

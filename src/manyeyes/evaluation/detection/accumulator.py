@@ -97,14 +97,15 @@ class MetricAccumulator:
         self.frames += compute_frame_ious(result, self.protocol)
         self.speeds += [truth.of_classes((name,)).velocity.norm(dim=1) for name in self.protocol.classes]
         received = (h.message for h in step.perception.received)
-        arrived = {m.agent_id: tuple(m.tokens.features.shape) for m in received if m.tokens is not None}
+        channels = max((m.tokens.features.shape[1] for m in received if m.tokens is not None), default=0)
         for sent in step.sent:
             if sent.num_packets:
                 self.share_s.append(sent.seconds)
             if sent.num_packets and sent.agent_id != ego:
-                cells, channels = arrived.get(sent.agent_id, (0, 0))
+                held = sent.contents
+                counts = (held.num_tokens, channels, held.num_objects, held.num_points)
                 record = MessageRecord(
-                    snapshot.scenario, snapshot.index, sent.agent_id, sent.num_bytes, cells, channels, ego=ego
+                    snapshot.scenario, snapshot.index, sent.agent_id, sent.num_bytes, *counts, ego=ego
                 )
                 self.messages.append(record)
         self.ages_s += step.ages_s

@@ -20,7 +20,9 @@ from manyeyes.datatypes import ConfigError
 
 @dataclass(frozen=True)
 class MessageRecord:
-    """One message that was sent in a frame. agent ids name sender and ego; ego is who it was counted for."""
+    """One message that was sent in a frame. agent ids name sender and ego; ego is who it was counted for. Contents are those of the
+    sent packets; num_channels: of a row of tokens at the receiver, 0 where no tokens arrived in the frame.
+    """
 
     scenario: str
     index: int
@@ -55,6 +57,8 @@ class Communication:
     mean_log2_bytes: float
     log2_paper_bytes: float
     tokens_per_message: float
+    objects_per_message: float = math.nan
+    points_per_message: float = math.nan
 
 
 def compute_paper_bytes(num_tokens: int, num_channels: int) -> int:
@@ -86,6 +90,8 @@ def summarize_messages(
             _ratio(sum(compute_paper_bytes(r.num_tokens, r.num_channels) for r in records), len(records))
         ),
         tokens_per_message=_ratio(sum(r.num_tokens for r in records), len(records)),
+        objects_per_message=_ratio(sum(r.num_objects for r in records), len(records)),
+        points_per_message=_ratio(sum(r.num_points for r in records), len(records)),
     )
 
 
