@@ -44,8 +44,8 @@ class StoredRow:
 
     def compare(self, again: dict[str, Any], tolerance: float = 0.0) -> tuple[str, ...]:
         """Return what differs in a row that was made again, one text for each value; its command may name other data."""
-        pairs = ({key: value for key, value in row.items() if key != COMMAND} for row in (self.fields, again))
-        return tuple(_find_differences("", *pairs, tolerance))
+        stored, made = ({key: value for key, value in row.items() if key != COMMAND} for row in (self.fields, again))
+        return tuple(_find_differences("", stored, made, tolerance))
 
 
 def draw_rows(path: Path, count: int, seed: int) -> tuple[StoredTable, tuple[StoredRow, ...]]:
@@ -111,7 +111,7 @@ def _find_differences(name: str, stored: Any, again: Any, tolerance: float) -> I
             yield from _find_differences(f"{name}.{key}".lstrip("."), stored.get(key), again.get(key), tolerance)
     elif isinstance(stored, list) and isinstance(again, list) and len(stored) == len(again):
         for at, pair in enumerate(zip(stored, again)):
-            yield from _find_differences(f"{name}[{at}]", *pair, tolerance)
+            yield from _find_differences(f"{name}[{at}]", pair[0], pair[1], tolerance)
     elif isinstance(stored, (int, float)) and isinstance(again, (int, float)):
         if abs(stored - again) > tolerance:
             yield f"{name}: {stored} in the table, {again} made again"
