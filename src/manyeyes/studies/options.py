@@ -69,7 +69,7 @@ class RobustnessOptions(EvaluationOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class MainTableOptions(EvaluationOptions):
-    """Options of the study main-table; its own channels and correctors replace --channel, --latency-budget-ms, --pose-correction."""
+    """Options of the study main-table; channels and correctors replace --channel, --latency-budget-ms, --pose-correction."""
 
     replay_options: ReplayOptions = field(default_factory=lambda: ReplayOptions(methods=BOTH_FORMS))
     """How agents collaborate."""
