@@ -12,14 +12,14 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from manyeyes._bounds import InputPath, NonNegativeFloat, PositiveInt, Seed
+from manyeyes._bounds import NonNegativeFloat, PositiveInt, Seed
 
 
 @dataclass(frozen=True)
 class Options:
     """Which rows, and how they are made."""
 
-    result: Positional[InputPath]
+    result: Positional[Path]
     """JSON of a study whose rows name their commands: main-table, byte-curves."""
     count: PositiveInt = 3
     """Number of rows."""
