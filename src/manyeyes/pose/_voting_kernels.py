@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from manyeyes._jit import Boolx2, F64x1, F64x2, I64x1, I64x2, njit
+from manyeyes._jit import Boolx1, Boolx2, F64x1, F64x2, F64x3, I64x1, I64x2, njit
 
 _PI = np.pi
 # Columns of a covariance (N, 3).
@@ -46,10 +46,23 @@ class Edges(NamedTuple):
     heading: F64x2
 
 
-class LandmarkGrid(NamedTuple):
-    """Points by square cells: cell c = column * num_rows + row holds ``order[start[c]:start[c + 1]]``; columns go along x."""
+class EdgeMatches(NamedTuple):
+    """Matched edges. edges: (H, 2) of a and of b; swapped: (H,) whether the ends of b's edge are exchanged; turn: (H,) radians, of
+    the edge, from both headings; misfit: (H,) squared residuals.
+    """
 
-    order: I64x1
+    edges: I64x2
+    swapped: Boolx1
+    turn: F64x1
+    misfit: F64x1
+
+
+class LandmarkGrid(NamedTuple):
+    """Landmarks by square cells, each in all cells within reach of it: cell c = column * num_rows + row holds
+    ``rows[start[c]:start[c + 1]]``; columns go along x.
+    """
+
+    rows: I64x1
     start: I64x1
     x_min: float
     y_min: float
@@ -66,6 +79,16 @@ class InverseCovariance(NamedTuple):
     yy: float
 
 
+class RefinedPoses(NamedTuple):
+    """Refined poses (K, 3) and their information (K, 3, 3); rows start[k] to start[k + 1] of pairs and misfit belong to pose k."""
+
+    poses: F64x2
+    information: F64x3
+    pairs: I64x2
+    misfit: F64x1
+    start: I64x1
+
+
 class RefinedPose(NamedTuple):
     """pose: (3,) x, y, yaw; information: (3, 3) of it; pairs: (P, 2) landmarks of a and b; misfit: (P,) squared."""
 
@@ -78,7 +101,15 @@ class RefinedPose(NamedTuple):
 @njit(cache=True, nogil=True)
 def wrap_half_turn(angle: float) -> float:  # pragma: no cover - compiled
     """Return an angle modulo pi, in [-pi/2, pi/2)."""
-    return (angle + 0.5 * _PI) % _PI - 0.5 * _PI
+    shifted = angle + 0.5 * _PI
+    # What % gives for the angles that occur most, without its division.
+    if 0.0 <= shifted < _PI:
+        return shifted - 0.5 * _PI
+    if _PI <= shifted < 2.0 * _PI:
+        return shifted - _PI - 0.5 * _PI
+    if -_PI <= shifted < 0.0:
+        return shifted + _PI - 0.5 * _PI
+    return shifted % _PI - 0.5 * _PI
 
 
 @njit(cache=True, nogil=True)
@@ -131,24 +162,24 @@ def match_edges(
     edges_b: Edges,
     is_compatible: Boolx2,
     gate: float,
-    max_poses: int,
-) -> tuple[F64x2, F64x1]:  # pragma: no cover - compiled
-    """Return poses (H, 3) a_from_b of edges that agree within ``gate`` standard deviations, and their squared residuals (H,).
+    max_matches: int,
+) -> EdgeMatches:  # pragma: no cover - compiled
+    """Return edges that agree within ``gate`` standard deviations.
 
-    edges_a, edges_b: by ascending length. is_compatible: (N, M) pairs that may be one object. Only the first max_poses are
+    edges_a, edges_b: by ascending length. is_compatible: (N, M) pairs that may be one object. Only the first max_matches are
     returned.
     """
-    xy_a, _, sxy_a, syaw_a = a
-    xy_b, _, sxy_b, syaw_b = b
-    ends_a, length_a, direction_a, heading_a = edges_a
-    ends_b, length_b, direction_b, heading_b = edges_b
-    out = np.empty((max_poses, 3))
-    misfit = np.empty(max_poses)
-    count = 0
+    ends_a, length_a, _, heading_a = edges_a
+    ends_b, length_b, _, heading_b = edges_b
+    square_gate = gate * gate
+    edges, swapped = np.empty((max_matches, 2), np.int64), np.empty(max_matches, np.bool_)
+    turns, misfit = np.empty(max_matches), np.empty(max_matches)
+    variance_a, variance_b = _edge_variances(ends_a, a.sigma_xy), _edge_variances(ends_b, b.sigma_xy)
+    yaw_weight = _yaw_weights(a.sigma_yaw, b.sigma_yaw)
+    count, low = 0, 0
     largest = 0.0
-    if len(sxy_a) and len(sxy_b):
-        largest = gate * 2.0 * max(sxy_a.max(), sxy_b.max())
-    low = 0
+    if len(a.xy) and len(b.xy):
+        largest = gate * 2.0 * max(a.sigma_xy.max(), b.sigma_xy.max())
     for p in range(len(ends_a)):
         while low < len(ends_b) and length_b[low] < length_a[p] - largest:
             low += 1
@@ -156,49 +187,109 @@ def match_edges(
         for q in range(low, len(ends_b)):
             if length_b[q] > length_a[p] + largest:
                 break
+            square, spread = (length_a[p] - length_b[q]) ** 2, variance_a[p] + variance_b[q]
+            if square > square_gate * spread:
+                continue
             for way in range(2):
                 k, m = ends_b[q, way], ends_b[q, 1 - way]
                 if not (is_compatible[i, k] and is_compatible[j, m]):
                     continue
-                spread = sxy_a[i] ** 2 + sxy_b[k] ** 2 + sxy_a[j] ** 2 + sxy_b[m] ** 2
-                cost = (length_a[p] - length_b[q]) ** 2 / spread
-                if cost > gate * gate:
-                    continue
-                tilt = spread / (length_a[p] * length_b[q])
-                one = wrap_half_turn(heading_a[p, 0] - heading_b[q, way])
-                two = wrap_half_turn(heading_a[p, 1] - heading_b[q, 1 - way])
+                one = _wrap_near(heading_a[p, 0] - heading_b[q, way])
+                two = _wrap_near(heading_a[p, 1] - heading_b[q, 1 - way])
                 # Headings relative to the edge: one unknown turn of the edge, two measured angles.
-                v1, v2 = syaw_a[i] ** 2 + syaw_b[k] ** 2, syaw_a[j] ** 2 + syaw_b[m] ** 2
-                weight = 1.0 / tilt + 1.0 / v1 + 1.0 / v2
-                turn = (one / v1 + two / v2) / weight
-                cost += turn * turn / tilt + (one - turn) ** 2 / v1 + (two - turn) ** 2 / v2
-                if cost > gate * gate or count == max_poses:
+                w1, w2 = yaw_weight[i, k], yaw_weight[j, m]
+                if (one - two) ** 2 * w1 * w2 > square_gate * (w1 + w2):
                     continue
-                yaw = direction_a[p] - direction_b[q] + turn + (_PI if way else 0.0)
-                c, s = np.cos(yaw), np.sin(yaw)
-                mx, my = 0.5 * (xy_b[k, 0] + xy_b[m, 0]), 0.5 * (xy_b[k, 1] + xy_b[m, 1])
-                out[count, 0] = 0.5 * (xy_a[i, 0] + xy_a[j, 0]) - (c * mx - s * my)
-                out[count, 1] = 0.5 * (xy_a[i, 1] + xy_a[j, 1]) - (s * mx + c * my)
-                out[count, 2] = (yaw + _PI) % (2.0 * _PI) - _PI
-                misfit[count] = cost
+                w0 = length_a[p] * length_b[q] / spread
+                turn = (one * w1 + two * w2) / (w0 + w1 + w2)
+                cost = square / spread + turn * turn * w0 + (one - turn) ** 2 * w1 + (two - turn) ** 2 * w2
+                if cost > square_gate or count == max_matches:
+                    continue
+                edges[count, 0], edges[count, 1], swapped[count] = p, q, way == 1
+                turns[count], misfit[count] = turn, cost
                 count += 1
-    return out[:count], misfit[:count]
+    return EdgeMatches(edges[:count], swapped[:count], turns[:count], misfit[:count])
 
 
 @njit(cache=True, nogil=True)
-def build_grid(xy: F64x2, cell: float) -> LandmarkGrid:  # pragma: no cover - compiled
-    """Sort points (N, 2) into square cells of edge cell; cells grow where there would be too many."""
-    x0, y0, x1, y1 = xy[:, 0].min(), xy[:, 1].min(), xy[:, 0].max(), xy[:, 1].max()
-    cell = max(cell, max(x1 - x0, y1 - y0) / 1000.0)
-    nx, ny = int((x1 - x0) / cell) + 1, int((y1 - y0) / cell) + 1
-    key = np.empty(len(xy), np.int64)
-    start = np.zeros(nx * ny + 1, np.int64)
+def _edge_variances(ends: I64x2, sigma_xy: F64x1) -> F64x1:  # pragma: no cover - compiled
+    """Return (E,) sums of the variances of both ends."""
+    out = np.empty(len(ends))
+    for p in range(len(ends)):
+        out[p] = sigma_xy[ends[p, 0]] ** 2 + sigma_xy[ends[p, 1]] ** 2
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _yaw_weights(sigma_a: F64x1, sigma_b: F64x1) -> F64x2:  # pragma: no cover - compiled
+    """Return (N, M) inverse variances of the difference of two headings."""
+    out = np.empty((len(sigma_a), len(sigma_b)))
+    for i in range(len(sigma_a)):
+        for k in range(len(sigma_b)):
+            out[i, k] = 1.0 / (sigma_a[i] ** 2 + sigma_b[k] ** 2)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _wrap_near(angle: float) -> float:  # pragma: no cover - compiled
+    """Return an angle modulo pi, in [-pi/2, pi/2), as :func:`wrap_half_turn` but for rounding, without a division."""
+    return angle - _PI * np.floor(angle * (1.0 / _PI) + 0.5)
+
+
+@njit(cache=True, nogil=True)
+def compute_edge_poses(
+    xy_a: F64x2, xy_b: F64x2, edges_a: Edges, edges_b: Edges, matches: EdgeMatches, rows: I64x1
+) -> F64x2:  # pragma: no cover - compiled
+    """Return poses (R, 3) a_from_b of these rows of the matches."""
+    out = np.empty((len(rows), 3))
+    for n in range(len(rows)):
+        p, q = matches.edges[rows[n], 0], matches.edges[rows[n], 1]
+        way = 1 if matches.swapped[rows[n]] else 0
+        i, j = edges_a.ends[p, 0], edges_a.ends[p, 1]
+        k, m = edges_b.ends[q, way], edges_b.ends[q, 1 - way]
+        yaw = edges_a.direction[p] - edges_b.direction[q] + matches.turn[rows[n]] + (_PI if way else 0.0)
+        c, s = np.cos(yaw), np.sin(yaw)
+        mx, my = 0.5 * (xy_b[k, 0] + xy_b[m, 0]), 0.5 * (xy_b[k, 1] + xy_b[m, 1])
+        out[n, 0] = 0.5 * (xy_a[i, 0] + xy_a[j, 0]) - (c * mx - s * my)
+        out[n, 1] = 0.5 * (xy_a[i, 1] + xy_a[j, 1]) - (s * mx + c * my)
+        out[n, 2] = (yaw + _PI) % (2.0 * _PI) - _PI
+    return out
+
+
+@njit(cache=True, nogil=True)
+def build_grid(xy: F64x2, reach: float) -> LandmarkGrid:  # pragma: no cover - compiled
+    """Put landmarks (N, 2) into all cells of edge ``reach`` (m) within reach of them; cells grow where there would be too many."""
+    # Wider than the reach: rounding of a query's cell then never matters.
+    margin = 1.001 * reach
+    x0, y0 = xy[:, 0].min() - margin, xy[:, 1].min() - margin
+    width, height = xy[:, 0].max() + margin - x0, xy[:, 1].max() + margin - y0
+    cell = max(reach, max(width, height) / 1000.0)
+    nx, ny = int(width / cell) + 1, int(height / cell) + 1
+    landmark, at = np.empty(64, np.int64), np.empty(64, np.int64)
+    count = 0
     for n in range(len(xy)):
-        key[n] = int((xy[n, 0] - x0) / cell) * ny + int((xy[n, 1] - y0) / cell)
-        start[key[n] + 1] += 1
-    start = np.cumsum(start)
-    order = np.argsort(key, kind="mergesort")
-    return LandmarkGrid(order, start, x0, y0, nx, ny, cell)
+        x, y = xy[n, 0] - x0, xy[n, 1] - y0
+        for i in range(int((x - margin) / cell), min(int((x + margin) / cell), nx - 1) + 1):
+            dx = max(i * cell - x, x - (i + 1) * cell, 0.0)
+            for j in range(int((y - margin) / cell), min(int((y + margin) / cell), ny - 1) + 1):
+                dy = max(j * cell - y, y - (j + 1) * cell, 0.0)
+                if dx * dx + dy * dy > margin * margin:
+                    continue
+                if count == len(at):
+                    landmark, at = np.append(landmark, landmark), np.append(at, at)
+                landmark[count], at[count] = n, i * ny + j
+                count += 1
+    # One more cell, which is empty: that of all points outside.
+    start = np.zeros(nx * ny + 2, np.int64)
+    for n in range(count):
+        start[at[n]] += 1
+    for cell_number in range(1, len(start)):
+        start[cell_number] += start[cell_number - 1]
+    rows = np.empty(count, np.int64)
+    for n in range(count):
+        start[at[n]] -= 1
+        rows[start[at[n]]] = landmark[n]
+    return LandmarkGrid(rows, start, x0, y0, nx, ny, cell)
 
 
 @njit(cache=True, nogil=True)
@@ -211,30 +302,33 @@ def compute_support(
     tau: float,
     turn: float,
 ) -> F64x1:  # pragma: no cover - compiled
-    """Return (H,) sum over landmarks of b of the best max(0, 1 - d^2 / tau^2) among a's."""
-    xy_a, yaw_a, _, _ = a
-    xy_b, yaw_b, _, _ = b
-    order, start, x0, y0, nx, ny, cell = grid
+    """Return (H,) sum over landmarks of b of the best max(0, 1 - d^2 / tau^2) among a's; grid: of a's, of reach tau."""
+    n = len(b.xy)
+    bx, by = np.ascontiguousarray(b.xy[:, 0]), np.ascontiguousarray(b.xy[:, 1])
+    xs, ys, cells = np.empty(n), np.empty(n), np.empty(n, np.int64)
+    per_cell = 1.0 / grid.cell_m
+    outside = grid.num_columns * grid.num_rows
     score = np.zeros(len(poses))
     for h in range(len(poses)):
-        c, s = np.cos(poses[h, 2]), np.sin(poses[h, 2])
+        px, py, yaw = poses[h, 0], poses[h, 1], poses[h, 2]
+        c, s = np.cos(yaw), np.sin(yaw)
+        for k in range(n):
+            xs[k] = c * bx[k] - s * by[k] + px
+            ys[k] = s * bx[k] + c * by[k] + py
+            column, row = (xs[k] - grid.x_min) * per_cell, (ys[k] - grid.y_min) * per_cell
+            inside = (column >= 0.0) & (column < grid.num_columns) & (row >= 0.0) & (row < grid.num_rows)
+            cells[k] = int(column) * grid.num_rows + int(row) if inside else outside
         total = 0.0
-        for k in range(len(xy_b)):
-            x = c * xy_b[k, 0] - s * xy_b[k, 1] + poses[h, 0]
-            y = s * xy_b[k, 0] + c * xy_b[k, 1] + poses[h, 1]
-            i0, i1 = int(np.floor((x - tau - x0) / cell)), int(np.floor((x + tau - x0) / cell))
-            j0, j1 = int(np.floor((y - tau - y0) / cell)), int(np.floor((y + tau - y0) / cell))
-            if i1 < 0 or j1 < 0 or i0 >= nx or j0 >= ny:
-                continue
+        for k in range(n):
+            first, last = grid.start[cells[k]], grid.start[cells[k] + 1]
             best = 0.0
-            for i in range(max(i0, 0), min(i1, nx - 1) + 1):
-                for m in range(start[i * ny + max(j0, 0)], start[i * ny + min(j1, ny - 1) + 1]):
-                    r = order[m]
-                    gain = 1.0 - ((x - xy_a[r, 0]) ** 2 + (y - xy_a[r, 1]) ** 2) / (tau * tau)
-                    if gain <= best or not is_compatible[r, k]:
-                        continue
-                    if abs(wrap_half_turn(yaw_a[r] - yaw_b[k] - poses[h, 2])) < turn:
-                        best = gain
+            for m in range(first, last):
+                r = grid.rows[m]
+                gain = 1.0 - ((xs[k] - a.xy[r, 0]) ** 2 + (ys[k] - a.xy[r, 1]) ** 2) / (tau * tau)
+                if gain <= best or not is_compatible[r, k]:
+                    continue
+                if abs(wrap_half_turn(a.yaw[r] - b.yaw[k] - yaw)) < turn:
+                    best = gain
             total += best
         score[h] = total
     return score
@@ -362,12 +456,27 @@ def fit_pose(
         )
         if information[0, 0] <= 0.0:
             break
-        step = np.linalg.solve(information, gradient)
+        step = _solve_symmetric(information, gradient)
         pose += step
         pose[2] = (pose[2] + _PI) % (2.0 * _PI) - _PI
-        if np.abs(step).max() < 1e-11:
+        if max(abs(step[0]), abs(step[1]), abs(step[2])) < 1e-11:
             break
     return pose, information
+
+
+@njit(cache=True, nogil=True)
+def _solve_symmetric(matrix: F64x2, right: F64x1) -> F64x1:  # pragma: no cover - compiled
+    """Return the solution (3,) of a positive definite system (3, 3), by its factors L D L'."""
+    l10, l20 = matrix[0, 1] / matrix[0, 0], matrix[0, 2] / matrix[0, 0]
+    d1 = matrix[1, 1] - l10 * matrix[0, 1]
+    l21 = (matrix[1, 2] - l20 * matrix[0, 1]) / d1
+    d2 = matrix[2, 2] - l20 * matrix[0, 2] - l21 * l21 * d1
+    out = np.empty(3)
+    y1 = right[1] - l10 * right[0]
+    out[2] = (right[2] - l20 * right[0] - l21 * y1) / d2
+    out[1] = y1 / d1 - l21 * out[2]
+    out[0] = right[0] / matrix[0, 0] - l10 * out[1] - l20 * out[2]
+    return out
 
 
 @njit(cache=True, nogil=True)
@@ -394,3 +503,57 @@ def refine_pose(
         pose, information = fit_pose(pose, pairs, a, b, 12)
     pairs, misfit = match_one_to_one(pose, a, b, is_compatible, 0.0, gate)
     return RefinedPose(pose, information, pairs, misfit)
+
+
+@njit(cache=True, nogil=True)
+def refine_poses(
+    starts: F64x2,
+    a: OrientedLandmarks,
+    b: OrientedLandmarks,
+    is_compatible: Boolx2,
+    slack: float,
+    gate: float,
+    rounds: int,
+) -> RefinedPoses:  # pragma: no cover - compiled
+    """Refine each of the poses (K, 3) by :func:`refine_pose`."""
+    most = min(len(a.xy), len(b.xy))
+    poses, information = np.empty((len(starts), 3)), np.empty((len(starts), 3, 3))
+    pairs, misfit = np.empty((len(starts) * most, 2), np.int64), np.empty(len(starts) * most)
+    start = np.zeros(len(starts) + 1, np.int64)
+    for k in range(len(starts)):
+        refined = refine_pose(starts[k], a, b, is_compatible, slack, gate, rounds)
+        poses[k], information[k] = refined.pose, refined.information
+        first, last = start[k], start[k] + len(refined.pairs)
+        pairs[first:last], misfit[first:last], start[k + 1] = refined.pairs, refined.misfit, last
+    return RefinedPoses(poses, information, pairs[: start[-1]], misfit[: start[-1]], start)
+
+
+@njit(cache=True, nogil=True)
+def select_separate(
+    poses: F64x2, middles: F64x2, max_distance: float, max_turn: float
+) -> I64x1:  # pragma: no cover - compiled
+    """Return rows of poses (K, 3), best first, without those alike a better one: within ``max_turn`` radians of it, and within
+    ``max_distance`` metres at its middle (K, 2), a point of b.
+    """
+    rows, count = np.empty(len(poses), np.int64), 0
+    for n in range(len(poses)):
+        new = True
+        for m in rows[:count]:
+            turn = abs((poses[n, 2] - poses[m, 2] + _PI) % (2.0 * _PI) - _PI)
+            if turn >= max_turn:
+                continue
+            x, y = _transform(poses[n], middles[m])
+            better_x, better_y = _transform(poses[m], middles[m])
+            if np.hypot(x - better_x, y - better_y) < max_distance:
+                new = False
+                break
+        if new:
+            rows[count] = n
+            count += 1
+    return rows[:count]
+
+
+@njit(cache=True, nogil=True)
+def _transform(pose: F64x1, point: F64x1) -> tuple[float, float]:  # pragma: no cover - compiled
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return pose[0] + c * point[0] - s * point[1], pose[1] + s * point[0] + c * point[1]

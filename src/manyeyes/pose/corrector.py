@@ -109,7 +109,7 @@ def rank_candidates(found: list[Candidate], prior: PosePrior | None, prior_volum
     """Rank candidates by score plus the log density ratio of the prior."""
     if not found:
         return None
-    scores = [c.score + _prior_log_ratio(c, prior, prior_volume) for c in found]
+    scores = [c.score + ratio for c, ratio in zip(found, _prior_log_ratios(found, prior, prior_volume))]
     order = sorted(range(len(found)), key=lambda n: (-scores[n], n))
     first = order[0]
     if len(order) == 1:
@@ -127,7 +127,7 @@ def decide(
     if ranked is None:
         return no_estimate(prior)
     best = ranked.best
-    prior_agrees = _prior_log_ratio(best, prior, acceptance.prior_volume) > 0
+    prior_agrees = _prior_log_ratios([best], prior, acceptance.prior_volume)[0] > 0
     is_conflict = prior is not None and mahalanobis_squared(best.pose, best.covariance, prior) > CHI2_3DOF_P001
     extra_margin = acceptance.conflict_margin if is_conflict else 0.0
     if ranked.score < min_score + extra_margin or len(best.pairs) < (1 if prior_agrees else acceptance.min_pairs):
@@ -190,11 +190,13 @@ def mahalanobis_squared(pose: Floats, covariance: Floats, prior: PosePrior) -> f
     return float(delta @ np.linalg.solve(covariance + prior.covariance, delta))
 
 
-def _prior_log_ratio(candidate: Candidate, prior: PosePrior | None, prior_volume: float) -> float:
-    """Log density of a pose under the prior, over that of a uniform pose; never negative."""
+def _prior_log_ratios(candidates: list[Candidate], prior: PosePrior | None, prior_volume: float) -> list[float]:
+    """Log density of each pose under the prior, over that of a uniform pose; never negative."""
     if prior is None:
-        return 0.0
-    spread = candidate.covariance + prior.covariance
-    distance = mahalanobis_squared(candidate.pose, candidate.covariance, prior)
+        return [0.0] * len(candidates)
+    spread = np.array([c.covariance for c in candidates]) + prior.covariance
+    delta = np.array([c.pose for c in candidates]) - prior.pose
+    delta[:, 2] = (delta[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    distance = (delta * np.linalg.solve(spread, delta[:, :, None])[:, :, 0]).sum(1)
     _, size = np.linalg.slogdet(2 * np.pi * spread)
-    return max(0.0, math.log(prior_volume) - (size + distance) / 2)
+    return np.maximum(0.0, math.log(prior_volume) - (size + distance) / 2).tolist()

@@ -9,6 +9,7 @@ probability p. The result does not depend on the order of landmarks nor on which
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -100,14 +101,14 @@ def find_candidates(
         found = _search(b, a, config, None if start is None else _inverse(start))
     else:
         found = _search(a, b, config, start)
+    if not found:
+        return []
     out = []
-    for pose, information, pairs, misfit, score in found:
-        dof = 3 * len(pairs) - 3
-        total = float(misfit.sum())
-        covariance = _covariance(information, len(pairs), total, dof, config)
+    for (pose, _, pairs, misfit, score), covariance in zip(found, _covariances(found, config)):
         if swapped:
             pose, covariance, pairs = *_invert(pose, covariance), pairs[:, ::-1]
         rows = np.stack((rows_e[pairs[:, 0]], rows_o[pairs[:, 1]]), 1)
+        total, dof = float(misfit.sum()), 3 * len(pairs) - 3
         out.append(Candidate(pose, (covariance + covariance.T) / 2, rows[np.lexsort(rows.T)], score, total, dof))
     return out
 
@@ -128,25 +129,45 @@ def _search(a: Landmarks, b: Landmarks, config: VoteConfig, start: Floats | None
     support = loops.compute_support(
         poses, numbers_a, numbers_b, is_compatible, grid, config.support_radius_m, config.support_yaw_rad
     )
-    # Ties of the support are ordered by the pose itself, never by its place in a list.
-    order = np.lexsort((*poses.T, -np.round(support, 9)))
-    middle = b.xy.mean(0)
-    best = poses[
-        loops.select_distinct(
-            poses, order, middle, config.max_refined, config.min_separation_m / 2, config.min_separation_rad / 2
-        )
-    ]
+    best = poses[_select_supported(poses, support, b.xy.mean(0), config)]
     if start is not None:
         best = np.concatenate((best, start[None]))
-    found = []
-    for pose in best:
-        pose, information, pairs, misfit = loops.refine_pose(
-            pose, exact_a, exact_b, is_compatible, 1.0, config.pair_gate, 14
+    refined = loops.refine_poses(best, exact_a, exact_b, is_compatible, 1.0, config.pair_gate, 14)
+    return _merge_alike(_rank_refined(a, b, refined, config), b, config)
+
+
+def _select_supported(poses: Floats, support: Floats, middle: Floats, config: VoteConfig) -> Ints:
+    """Return rows of at most max_refined distinct poses, of the largest support first. Ties of the support are ordered by the pose
+    itself, never by its place in a list.
+
+    Only as many of the best are sorted as that takes.
+    """
+    support, count = np.round(support, 9), 16 * config.max_refined
+    while True:
+        rows = np.arange(len(poses))
+        if count < len(poses):
+            rows = np.flatnonzero(support >= np.partition(support, -count)[-count])
+        order = rows[np.lexsort((*poses[rows].T, -support[rows]))]
+        chosen = loops.select_distinct(
+            poses, order, middle, config.max_refined, config.min_separation_m / 2, config.min_separation_rad / 2
         )
-        if len(pairs):
-            found.append((pose, information, pairs, misfit, _score(a, b, pose, pairs, misfit, config)))
+        if len(chosen) == config.max_refined or len(rows) == len(poses):
+            return chosen
+        count *= 4
+
+
+def _rank_refined(a: Landmarks, b: Landmarks, refined: loops.RefinedPoses, config: VoteConfig) -> list[_Found]:
+    """Return the refined poses that have pairs, by falling score."""
+    gain = _pair_gains(a, b, refined, config)
+    found = []
+    for k, (first, last) in enumerate(itertools.pairwise(refined.start.tolist())):
+        if first < last:
+            pairs, part = refined.pairs[first:last], gain[first:last]
+            i = pairs[:, 0]
+            score = float(part[_keep_static_once(a.xy[i], a.instant[i], part, config.static_radius_m)].sum())
+            found.append((refined.poses[k], refined.information[k], pairs, refined.misfit[first:last], score))
     found.sort(key=lambda f: (-f[4], *f[0]))
-    return _merge_alike(found, b, config)
+    return found
 
 
 def _numbers(x: Landmarks) -> loops.LandmarkArrays:
@@ -163,16 +184,19 @@ def _with_place_covariance(x: Landmarks, lateral_sigma_ratio: float) -> loops.Or
 
 
 def _hypotheses(a: Landmarks, b: Landmarks, is_compatible: NDArray[np.bool_], config: VoteConfig) -> Floats:
-    max_poses = 100 * config.max_hypotheses
-    poses, misfit = loops.match_edges(
-        _numbers(a), _numbers(b), _edges(a, config), _edges(b, config), is_compatible, config.edge_gate, max_poses
+    """Return poses (H, 3) a_from_b of matching edges, at most max_hypotheses, those of the smallest residual."""
+    edges_a, edges_b = _edges(a, config), _edges(b, config)
+    matches = loops.match_edges(
+        _numbers(a), _numbers(b), edges_a, edges_b, is_compatible, config.edge_gate, 100 * config.max_hypotheses
     )
-    if len(poses) > config.max_hypotheses:
+    misfit, most = matches.misfit, config.max_hypotheses
+    rows = np.arange(len(misfit))
+    if len(misfit) > most:
         # Sorting all of them, of which most are not kept, would cost as much as finding them.
-        near = misfit <= np.partition(misfit, config.max_hypotheses - 1)[config.max_hypotheses - 1]
-        poses, misfit = poses[near], misfit[near]
-        poses = poses[np.lexsort((*poses.T, misfit))[: config.max_hypotheses]]
-    return poses
+        rows = np.flatnonzero(misfit <= np.partition(misfit, most - 1)[most - 1])
+    poses = loops.compute_edge_poses(a.xy, b.xy, edges_a, edges_b, matches, rows)
+    # The order of hypotheses does not matter, apart from ties of the last one that is kept.
+    return poses if len(poses) <= most else poses[np.lexsort((*poses.T, misfit[rows]))[:most]]
 
 
 def _edges(x: Landmarks, config: VoteConfig) -> loops.Edges:
@@ -182,15 +206,16 @@ def _edges(x: Landmarks, config: VoteConfig) -> loops.Edges:
     return loops.Edges(edges.ends[order], edges.length[order], edges.direction[order], edges.heading[order])
 
 
-def _score(a: Landmarks, b: Landmarks, pose: Floats, pairs: Ints, misfit: Floats, config: VoteConfig) -> float:
-    """Log-likelihood ratio of the pairs; a pair more likely by chance contributes its heading only."""
-    i, k = pairs.T
-    gain = np.log(config.chance_area_m2 / (2 * np.pi * (a.sigma_xy[i] ** 2 + b.sigma_xy[k] ** 2))) - misfit / 2
-    flip_a, flip_b = np.clip(a.p_flip[i], 0.01, 0.5), np.clip(b.p_flip[k], 0.01, 0.5)
+def _pair_gains(a: Landmarks, b: Landmarks, refined: loops.RefinedPoses, config: VoteConfig) -> Floats:
+    """Return (P,) the log-likelihood ratio of each pair; a pair more likely by chance contributes its heading only."""
+    i, k = refined.pairs.T
+    variance = a.sigma_xy[i] ** 2 + b.sigma_xy[k] ** 2
+    gain = np.log(config.chance_area_m2 / (2 * np.pi * variance)) - refined.misfit / 2
+    flip_a, flip_b = np.clip(a.p_flip, 0.01, 0.5)[i], np.clip(b.p_flip, 0.01, 0.5)[k]
     agree = (1 - flip_a) * (1 - flip_b) + flip_a * flip_b
-    same = np.cos(a.yaw[i] - b.yaw[k] - pose[2]) > 0
-    gain = np.maximum(gain, 0.0) + np.log(2 * np.where(same, agree, 1 - agree))
-    return float(gain[_keep_static_once(a.xy[i], a.instant[i], gain, config.static_radius_m)].sum())
+    yaw = np.repeat(refined.poses[:, 2], np.diff(refined.start))
+    same = np.cos(a.yaw[i] - b.yaw[k] - yaw) > 0
+    return np.maximum(gain, 0.0) + np.log(2 * np.where(same, agree, 1 - agree))
 
 
 def _keep_static_once(xy: Floats, instant: Ints, gain: Floats, static_radius_m: float) -> NDArray[np.bool_]:
@@ -210,18 +235,13 @@ def _keep_static_once(xy: Floats, instant: Ints, gain: Floats, static_radius_m: 
 
 def _merge_alike(found: list[_Found], b: Landmarks, config: VoteConfig) -> list[_Found]:
     """Return the found poses, best first, without those within the separation limits of a better one."""
-    poses = np.array([f[0] for f in found]).reshape(-1, 3)
-    kept, gone = [], np.zeros(len(found), bool)
-    for n, one in enumerate(found):
-        if gone[n]:
-            continue
-        kept.append(one)
-        apart = transform_point(poses, b.xy[one[2][:, 1]].mean(0)) - transform_point(
-            one[0][None], b.xy[one[2][:, 1]].mean(0)
-        )
-        turn = np.abs(np.remainder(poses[:, 2] - one[0][2] + np.pi, 2 * np.pi) - np.pi)
-        gone |= (turn < config.min_separation_rad) & (np.hypot(apart[:, 0], apart[:, 1]) < config.min_separation_m)
-    return kept
+    if not found:
+        return []
+    middles = np.array([b.xy[pairs[:, 1]].mean(0) for _, _, pairs, _, _ in found])
+    rows = loops.select_separate(
+        np.array([pose for pose, *_ in found]), middles, config.min_separation_m, config.min_separation_rad
+    )
+    return [found[n] for n in rows]
 
 
 def transform_point(poses: Floats, point: Floats) -> Floats:
@@ -230,14 +250,17 @@ def transform_point(poses: Floats, point: Floats) -> Floats:
     return poses[:, :2] + np.stack((c * point[0] - s * point[1], s * point[0] + c * point[1]), 1)
 
 
-def _covariance(information: Floats, pairs: int, misfit: float, dof: int, config: VoteConfig) -> Floats:
-    """Return (3, 3): inverse information, scaled by the residuals (the mean of an inverse gamma prior on the scale), plus the
+def _covariances(found: list[_Found], config: VoteConfig) -> Floats:
+    """Return (K, 3, 3): inverse information, scaled by the residuals (the mean of an inverse gamma prior on the scale), plus the
     variance that all boxes of a view have in common.
     """
-    scale = (config.prior_dof + misfit) / (config.prior_dof + dof)
-    covariance = np.asarray(np.linalg.inv(information) * scale, np.float64)
+    information = np.array([f[1] for f in found])
+    misfit, pairs = np.array([(f[3].sum(), len(f[2])) for f in found]).T
+    scale = (config.prior_dof + misfit) / (config.prior_dof + 3 * pairs - 3)
+    covariance = np.asarray(np.linalg.inv(information) * scale[:, None, None], np.float64)
     # The first two of the diagonal sum the pairs' inverse variances along an axis.
-    covariance[[0, 1], [0, 1]] += config.common_variance_fraction * pairs * 2 / (information[0, 0] + information[1, 1])
+    common = config.common_variance_fraction * pairs * 2 / (information[:, 0, 0] + information[:, 1, 1])
+    covariance[:, [0, 1], [0, 1]] += common[:, None]
     return covariance
 
 
