@@ -21,7 +21,7 @@ def test_every_reason_is_in_the_table() -> None:
 
 def test_every_reason_of_a_rejected_sender_is_in_the_table() -> None:
     reasons = [reason for part in get_args(RejectionReason) for reason in (get_args(part) or (part,))]
-    assert len(reasons) == 11 and [reason for reason in reasons if f"`{reason}`" not in TEXT] == []
+    assert len(reasons) == 12 and [reason for reason in reasons if f"`{reason}`" not in TEXT] == []
 
 
 def test_the_bounds_are_those_of_the_code() -> None:

@@ -45,6 +45,9 @@ class ManualClock:
     def sleep(self, duration_ns: int) -> None:
         self.ns += max(duration_ns, 1)
 
+    def discipline(self) -> int:
+        return 0
+
 
 class Team:
     """Two live agents of the drive, in turn, on one channel and one clock. delay_ns: that a perception takes."""

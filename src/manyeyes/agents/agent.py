@@ -270,6 +270,12 @@ class Agent:
         rejected += perception.rejected
         return replace(perception, boxes=boxes, evidence=evidence, rejected=(*rejected, *left_out, *failed))
 
+    def reset_history(self) -> None:
+        """Forget what was received and perceived before: times before now are those of another clock."""
+        self.perception_cache.clear()
+        self.message_history = MessageHistory()
+        self._sender_states, self._accepted_poses, self._known_senders, self._assessment = {}, {}, {}, None
+
     def _check(
         self, frame: AgentFrame, reception: ReceivedMessage, now_ns: int, limits: ReceiverLimits
     ) -> tuple[ReceivedMessage | None, list[Rejection]]:

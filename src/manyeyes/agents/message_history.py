@@ -66,6 +66,10 @@ class MessageHistory:
             if self._is_recent(m, now_ns)
         ]
 
+    def forget(self, senders: Collection[int]) -> None:
+        """Forget the messages of senders."""
+        self._messages = {sender: messages for sender, messages in self._messages.items() if sender not in senders}
+
     def _is_recent(self, message: Message, time_ns: int) -> bool:
         return abs(time_ns - message.timestamp_ns) <= self._max_age_ns
 

@@ -110,6 +110,10 @@ class PerceptionCache:
         """The detector; ConfigError if it has no tokens."""
         return require_tokens(self.detector)
 
+    def clear(self) -> None:
+        """Forget all frames."""
+        self._outputs, self._merged, self._sent, self.last_fused = [], None, [], None
+
     def process(self, frame: AgentFrame) -> AgentOutput:
         """Detector output on a frame, with its previous sweep if there is one."""
         for cached_frame, output in self._outputs:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from manyeyes.comms.admission import Admission, Authenticator
 from manyeyes.comms.drop_counts import DropCounts, DropReason
@@ -17,7 +17,9 @@ from manyeyes.comms.sender_table import SenderTable
 from manyeyes.comms.token_format import TokenFormat, TokenRefusal
 from manyeyes.datatypes import Message
 
-RejectionReason = TokenRefusal | Literal["content_error", "quarantined", "time", "cells", "pose", "busy", "untrusted"]
+RejectionReason = (
+    TokenRefusal | Literal["content_error", "quarantined", "time", "cells", "pose", "busy", "untrusted", "skewed"]
+)
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class Rejection:
     reason: as in DropCounts, or content_error: fusing it raised an error, which is the cause; quarantined: its content did so
     shortly before; time: captured too long before or after the receiver's time; pose: its pose is implausible and could not be
     estimated; cells: more tokens in one message than are fused; busy: beyond the number of senders that are fused at one instant;
-    untrusted: a misbehaviour detector excludes it.
+    untrusted: a misbehaviour detector excludes it; skewed: its clock is wrong by the arrivals of its messages.
     text: what was expected, what came.
     """
 
@@ -72,6 +74,14 @@ class ReceivedMessage:
     def age_ns(self, now_ns: int) -> int:
         """Return the age of information: now less the time of capture."""
         return now_ns - self.message.timestamp_ns
+
+
+class Arrival(NamedTuple):
+    """The newest message of a sender, and the time of its last packet."""
+
+    agent_id: int
+    timestamp_ns: int
+    arrival_ns: int
 
 
 class Inbox:
@@ -137,10 +147,23 @@ class Inbox:
             if assembly.header.timestamp_ns >= since_ns and len(assembly.fragments) == assembly.header.num_packets
         )
 
+    def arrivals(self) -> tuple[Arrival, ...]:
+        """Return the newest message of each sender with its arrival, without those that came without one. Nothing changes."""
+        return tuple(
+            Arrival(held.assembly.header.agent_id, held.timestamp_ns, held.last_arrival_ns)
+            for held in self._senders.current_messages()
+            if held.last_arrival_ns is not None
+        )
+
     def take_rejections(self) -> tuple[Rejection, ...]:
         """Senders whose tokens were refused since the last call, the last reason of each, by agent id."""
         taken, self._rejections = self._rejections, {}
         return tuple(rejection for _, rejection in sorted(taken.items()))
+
+    def clear(self) -> None:
+        """Drop the messages of all senders, and forget the senders: their times are those of another clock."""
+        self._senders.clear()
+        self._rejections.clear()
 
     def discard(self, agent_id: int) -> None:
         """Drop the messages of one sender; its next message is accepted again."""

@@ -100,6 +100,10 @@ class SenderTable:
         """Return the current message of each sender, by id."""
         return [sender.current for _, sender in sorted(self._senders.items()) if sender.messages]
 
+    def clear(self) -> None:
+        """Forget all senders."""
+        self._senders.clear()
+
     def discard(self, agent_id: int) -> None:
         """Drop the messages of a sender."""
         if agent_id in self._senders:

@@ -106,13 +106,18 @@ class _Unsigned:
 class PacketVerifier:
     """Authenticator of an inbox (``comms.admission.Authenticator``) in mode warn or require.
 
-    clock: nanoseconds since 1970, for packets without a time of arrival.
+    clock: nanoseconds since 1970, for packets without a time of arrival. utc_offset_ns: UTC, the time of certificates, less that of
+    arrivals.
     """
 
     def __init__(
-        self, trust: Trust, mode: Literal["warn", "require"] = "require", clock: Callable[[], int] = time.time_ns
+        self,
+        trust: Trust,
+        mode: Literal["warn", "require"] = "require",
+        clock: Callable[[], int] = time.time_ns,
+        utc_offset_ns: int = 0,
     ) -> None:
-        self.mode = mode
+        self.mode, self.utc_offset_ns = mode, utc_offset_ns
         self._clock = clock
         self._tickets: OrderedDict[bytes, _Ticket] = OrderedDict()
         self._quota = _Quota()
@@ -185,6 +190,7 @@ class PacketVerifier:
         self, certificate: Certificate, identifier: bytes, now_ns: int
     ) -> AuthenticationRefusal | None:
         """Return why a certificate is not admitted now, apart from its signature."""
+        now_ns += self.utc_offset_ns
         now_s, revoked = now_ns / NS_PER_S, self.trust.revoked
         if identifier in revoked.signers or certificate.issuer in revoked.issuers:
             return "revoked"

@@ -9,31 +9,41 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 from manyeyes.agents.agent import Agent, Perception
 from manyeyes.agents.strategies.no_fusion import NoFusion
 from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.comms.drop_counts import DropCounts
+from manyeyes.comms.inbox import Rejection
 from manyeyes.comms.network.interface import ReceivedPacket
 from manyeyes.comms.signatures.envelope import UNSIGNED, EnvelopeSize
 from manyeyes.datatypes import AgentFrame
 from manyeyes.runtime.authentication import PacketVerifier
+from manyeyes.runtime.sender_clocks import SenderClocks
 
 MAX_SENDERS_UNDER_LOAD = 4
+_SKEWED = "the clock of this sender differs from the receiver's, by the arrivals of its messages"
+UNSYNCHRONISED_NS = 1_000_000_000
 
 
 @dataclass
 class Engine:
-    """An agent, its inbox, and what a level of overload changes of them. verifier: of received packets; None in mode off."""
+    """An agent, its inbox, and what a level of overload changes of them. verifier: of received packets; None in mode off.
+
+    Senders whose clocks are wrong (``runtime.sender_clocks``) are not fused. After a step of its own clock the agent fuses nothing
+    for UNSYNCHRONISED_NS, and begins anew.
+    """
 
     agent: Agent
     verifier: PacketVerifier | None = None
+    _unsynchronised_until_ns: int | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self.inbox = self.agent.inbox(authenticator=self.verifier)
         self._strategy, self._pose_correction = self.agent.strategy, self.agent.pose_correction
         self._limits, self._num_frames = self.inbox.limits, 0
+        self.sender_clocks = SenderClocks()
 
     @property
     def dropped(self) -> DropCounts:
@@ -53,7 +63,26 @@ class Engine:
 
     def perceive(self, frame: AgentFrame, now_ns: int) -> Perception:
         """Return boxes of the frame and of what was received by now_ns."""
-        return self.agent.perceive(frame, self.inbox, now_ns)
+        for arrival in self.inbox.arrivals():
+            self.sender_clocks.record(arrival)
+        until_ns = self._unsynchronised_until_ns
+        if until_ns is not None and now_ns < until_ns:
+            return self.agent.perceive(frame, (), now_ns)
+        self._unsynchronised_until_ns = None
+        skewed = self.sender_clocks.skewed(now_ns)
+        for agent_id in skewed:
+            self.inbox.discard(agent_id)
+        self.agent.message_history.forget(skewed)
+        perception = self.agent.perceive(frame, self.inbox, now_ns)
+        rejected = [Rejection(agent_id, "skewed", _SKEWED) for agent_id in sorted(skewed)]
+        return replace(perception, rejected=(*perception.rejected, *rejected)) if rejected else perception
+
+    def step_clock(self, now_ns: int) -> None:
+        """Begin anew after a step of the agent's clock: times of what was received are those of another clock."""
+        self._unsynchronised_until_ns = now_ns + UNSYNCHRONISED_NS
+        self.agent.reset_history()
+        self.inbox.clear()
+        self.sender_clocks.clear()
 
     def _set_level(self, level: int) -> None:
         """Set what the agent does for one frame."""
@@ -69,8 +98,8 @@ class Engine:
 def digest_perception(perception: Perception) -> str:
     """Return a SHA-256 of all that a perception holds: every bit of the boxes, received and rejected senders, and all trust."""
     digest = hashlib.sha256()
-    for field in fields(perception.boxes):
-        digest.update(getattr(perception.boxes, field.name).detach().cpu().contiguous().numpy().tobytes())
+    for one in fields(perception.boxes):
+        digest.update(getattr(perception.boxes, one.name).detach().cpu().contiguous().numpy().tobytes())
     for one in perception.received:
         digest.update(struct.pack("<iqi", one.message.agent_id, one.message.timestamp_ns, one.received_packets))
     for rejection in perception.rejected:

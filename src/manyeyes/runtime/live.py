@@ -13,16 +13,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 from manyeyes.agents.agent import Agent, Perception
 from manyeyes.comms.drop_counts import DropCounts
 from manyeyes.comms.network.interface import Network
 from manyeyes.comms.signatures.envelope import UNSIGNED
 from manyeyes.datatypes import AgentFrame, ConfigError
-from manyeyes.runtime.clock import LiveClock
+from manyeyes.runtime.clock import Clock
 from manyeyes.runtime.engine import Engine, digest_packets, digest_perception
 from manyeyes.runtime.overload import OverloadLadder
-from manyeyes.runtime.recorder import FrameEvent, Recorder, TickEvent
+from manyeyes.runtime.recorder import ClockStep, FrameEvent, Recorder, TickEvent
 from manyeyes.runtime.security import Security, TrustWatcher
 from manyeyes.runtime.signing import PacketSigner
 from manyeyes.runtime.sources import NewestFrame
@@ -76,11 +77,22 @@ class LiveTick:
     note: str = ""
 
 
+class _Shared(NamedTuple):
+    """A frame whose packets are sent, and when that began and ended."""
+
+    frame: AgentFrame
+    sent: list[bytes]
+    level: int
+    begin_ns: int
+    shared_ns: int
+    note: str
+
+
 @dataclass
 class _Loop:
     engine: Engine
     network: Network
-    clock: LiveClock
+    clock: Clock
     config: LiveConfig
     security: Security
     recorder: Recorder | None
@@ -90,12 +102,17 @@ class _Loop:
     fused: frozenset[int] = frozenset()
     known: frozenset[str] = frozenset()
 
-    def run(self, frame: AgentFrame, skipped: int) -> LiveTick:
-        """Work on one frame."""
-        begin_ns, level = self.clock.now_ns(), self.ladder.level
-        note = self._reload_trust(begin_ns)
-        frame, sent = self._share(frame, level, begin_ns)
-        shared_ns = self.clock.now_ns()
+    def share(self, frame: AgentFrame) -> _Shared:
+        """Begin a frame: send its packets."""
+        note, level = self._follow_clock(), self.ladder.level
+        begin_ns = self.clock.now_ns()
+        note = self._reload_trust(begin_ns) or note
+        frame, sent = self._send(frame, level, begin_ns)
+        return _Shared(frame, sent, level, begin_ns, self.clock.now_ns(), note)
+
+    def perceive(self, shared: _Shared, skipped: int) -> LiveTick:
+        """End a frame: receive, and perceive."""
+        frame, sent, level, begin_ns, shared_ns, note = shared
         self._wait(frame)
         now_ns = self.clock.now_ns()
         perception = self.engine.perceive(frame, now_ns)
@@ -126,7 +143,7 @@ class _Loop:
             note,
         )
 
-    def _share(self, frame: AgentFrame, level: int, now_ns: int) -> tuple[AgentFrame, list[bytes]]:
+    def _send(self, frame: AgentFrame, level: int, now_ns: int) -> tuple[AgentFrame, list[bytes]]:
         """Send the packets of a frame; return it, under the pseudonym of its time, and what was sent."""
         pool, is_silent = self.security.pool, False
         if pool is not None:
@@ -168,6 +185,18 @@ class _Loop:
                 return
             self.clock.sleep(min(left_ns, _POLL_NS))
 
+    def _follow_clock(self) -> str:
+        """Follow the system clock; after a step of it, begin anew."""
+        step_ns = self.clock.discipline()
+        if not step_ns:
+            return ""
+        now_ns = self.clock.now_ns()
+        self.engine.step_clock(now_ns)
+        self.fused = frozenset()
+        if self.recorder is not None:
+            self.recorder.add(ClockStep(now_ns, step_ns))
+        return f"clock_step: {step_ns / 1e9:+.3f} s; nothing is fused for a second"
+
     def _reload_trust(self, now_ns: int) -> str:
         verifier = self.engine.verifier
         if self.watcher is None or verifier is None:
@@ -191,7 +220,7 @@ class LiveRun:
         frames: Iterable[AgentFrame],
         agent: Agent,
         network: Network,
-        clock: LiveClock,
+        clock: Clock,
         config: LiveConfig | None = None,
         security: Security | None = None,
         recorder: Recorder | None = None,
@@ -215,7 +244,15 @@ class LiveRun:
 
     def step(self, frame: AgentFrame) -> LiveTick:
         """Work on one frame, outside of an iteration."""
-        return self._loop.run(frame, self._source.num_skipped)
+        return self.perceive(self.share(frame))
+
+    def share(self, frame: AgentFrame) -> _Shared:
+        """Begin a frame, outside of an iteration: send its packets."""
+        return self._loop.share(frame)
+
+    def perceive(self, shared: _Shared) -> LiveTick:
+        """End a frame that was begun: receive, and perceive."""
+        return self._loop.perceive(shared, self._source.num_skipped)
 
     def stop(self) -> None:
         """End after the current frame; may be called from another thread or a signal handler."""
@@ -226,7 +263,7 @@ def live(
     frames: Iterable[AgentFrame],
     agent: Agent,
     network: Network,
-    clock: LiveClock,
+    clock: Clock,
     config: LiveConfig | None = None,
     security: Security | None = None,
 ) -> LiveRun:

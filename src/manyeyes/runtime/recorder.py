@@ -8,6 +8,7 @@
 | `/rx` | i64 arrival, u16 and u16 lengths of link and tile, both, the packet |
 | `/frame` | safetensors: cloud and poses; JSON in their metadata: level of overload, envelope, digest of the packets |
 | `/tick` | JSON: time of perception, digest of the result |
+| `/event` | JSON: a step of the agent's clock: its time after it, and by how much it stepped |
 
 Keys are never recorded. Events of a frame are written after its boxes. A file is whole, or it does not exist under its name: where
 the disk is full, what was recorded is lost, and the run goes on.
@@ -36,12 +37,22 @@ from manyeyes.runtime.trust_file import Trust
 
 _RX = struct.Struct("<qHH")
 _PURPOSE = "Recording a live run"
-_ENCODINGS = {"/config": "json", "/trust": "toml", "/rx": "manyeyes", "/frame": "safetensors", "/tick": "json"}
+_ENCODINGS = {
+    "/config": "json",
+    "/trust": "toml",
+    "/rx": "manyeyes",
+    "/frame": "safetensors",
+    "/tick": "json",
+    "/event": "json",
+}
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Settings that a replay needs to make the same agent. versions, num_threads: where it ran."""
+    """Settings that a replay needs to make the same agent. versions, num_threads: where it ran.
+
+    utc_offset_ns: UTC less the time of stamps and arrivals.
+    """
 
     weights: str
     fingerprint: str
@@ -52,6 +63,7 @@ class RunConfig:
     versions: dict[str, str | None]
     num_threads: int
     misbehaviour: str | None = None
+    utc_offset_ns: int = 0
 
 
 @dataclass(frozen=True)
@@ -72,7 +84,15 @@ class TickEvent:
     digest: str
 
 
-Event = RunConfig | Trust | ReceivedPacket | FrameEvent | TickEvent
+@dataclass(frozen=True)
+class ClockStep:
+    """The agent's clock stepped; now_ns: after the step."""
+
+    now_ns: int
+    step_ns: int
+
+
+Event = RunConfig | Trust | ReceivedPacket | FrameEvent | TickEvent | ClockStep
 
 
 class Recorder:
@@ -168,7 +188,7 @@ def _pack_event(event: Event) -> tuple[str, bytes]:
         return "/rx", _RX.pack(event.arrival_ns, len(link), len(tile)) + link + tile + event.packet
     if isinstance(event, FrameEvent):
         return "/frame", _pack_frame(event)
-    return "/tick", json.dumps(asdict(event)).encode()
+    return "/event" if isinstance(event, ClockStep) else "/tick", json.dumps(asdict(event)).encode()
 
 
 def _read_event(topic: str, data: bytes) -> Event:
@@ -184,6 +204,8 @@ def _read_event(topic: str, data: bytes) -> Event:
         return _read_frame(data)
     if topic == "/tick":
         return TickEvent(**json.loads(data))
+    if topic == "/event":
+        return ClockStep(**json.loads(data))
     raise ValueError(f"unknown topic {topic}")
 
 

@@ -12,7 +12,7 @@ from manyeyes.comms.network.interface import ReceivedPacket
 from manyeyes.datatypes import AgentFrame, RecordingError
 from manyeyes.runtime.authentication import PacketVerifier, SecurityMode
 from manyeyes.runtime.engine import Engine, digest_packets, digest_perception
-from manyeyes.runtime.recorder import FrameEvent, RunConfig, TickEvent, read_events
+from manyeyes.runtime.recorder import ClockStep, FrameEvent, RunConfig, TickEvent, read_events
 from manyeyes.runtime.trust_file import Trust
 
 
@@ -61,11 +61,13 @@ def replay_run(
         if isinstance(event, Trust) and config.security != "off":
             if engine.verifier is None:
                 mode = "require" if config.security == "require" else "warn"
-                engine = Engine(engine.agent, PacketVerifier(event, mode))
+                engine = Engine(engine.agent, PacketVerifier(event, mode, utc_offset_ns=config.utc_offset_ns))
             else:
                 engine.verifier.replace_trust(event)
         elif isinstance(event, ReceivedPacket):
             engine.push(event)
+        elif isinstance(event, ClockStep):
+            engine.step_clock(event.now_ns)
         elif isinstance(event, FrameEvent):
             frame = event
             packets = engine.share(event.frame, event.level, event.envelope)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.runtime.authentication import PacketVerifier, SecurityMode
+from manyeyes.runtime.clock import TAI_UTC_NS
 from manyeyes.runtime.pseudonyms import PseudonymPool
 from manyeyes.runtime.trust_file import Trust, TrustFileError
 
@@ -36,7 +37,7 @@ class Security:
         """Return the authenticator of received packets; None in mode off."""
         if self.mode == "off" or self.trust_file is None:
             return None
-        return PacketVerifier(Trust.load(self.trust_file), self.mode)
+        return PacketVerifier(Trust.load(self.trust_file), self.mode, utc_offset_ns=-TAI_UTC_NS)
 
 
 class TrustWatcher:

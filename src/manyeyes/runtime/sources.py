@@ -10,7 +10,7 @@ from dataclasses import replace
 from manyeyes.datasets.base import Recording
 from manyeyes.datasets.frame_reader import as_frame_reader
 from manyeyes.datatypes import AgentFrame, RecordingError
-from manyeyes.runtime.clock import LiveClock
+from manyeyes.runtime.clock import Clock
 
 _STEP_NS = 20_000_000
 
@@ -43,7 +43,7 @@ class NewestFrame:
     A frame is handed over at its time by the clock, not before. Iteration ends with the source, or after :meth:`stop`.
     """
 
-    def __init__(self, frames: Iterable[AgentFrame], clock: LiveClock) -> None:
+    def __init__(self, frames: Iterable[AgentFrame], clock: Clock) -> None:
         self._frames, self._clock = frames, clock
         self._condition = threading.Condition()
         self._newest: AgentFrame | None = None

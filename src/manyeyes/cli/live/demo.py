@@ -13,7 +13,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -165,6 +164,8 @@ _FREE_PORT = _FreePort()
 
 def _run_processes(commands: Sequence[Sequence[str]], options: Options, console: Console) -> float:
     """Start the processes together, and wait for their end; return the rate of their clock."""
+    from manyeyes.runtime.clock import read_tai_ns
+
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     # The end of this process ends those of the agents, too.
@@ -174,7 +175,7 @@ def _run_processes(commands: Sequence[Sequence[str]], options: Options, console:
         with console.status("Starting the agents"):
             seconds = [_read_ready(process) for process in processes]
         rate = options.rate or min(1.0, BUSY_FRACTION * (os.cpu_count() or 1) * FRAME_S / sum(seconds))
-        start_ns = time.time_ns() + 1_000_000_000
+        start_ns = read_tai_ns() + 1_000_000_000
         for process in processes:
             assert process.stdin is not None
             process.stdin.write(f"{start_ns} {rate!r}\n")

@@ -95,6 +95,7 @@ class MethodOptions:
         """Return the settings as a recording holds them."""
         import torch
 
+        from manyeyes.runtime.clock import TAI_UTC_NS
         from manyeyes.runtime.recorder import RunConfig
         from manyeyes.studies.provenance import installed_versions
 
@@ -108,6 +109,7 @@ class MethodOptions:
             versions=installed_versions(),
             num_threads=torch.get_num_threads(),
             misbehaviour=self.misbehaviour,
+            utc_offset_ns=-TAI_UTC_NS,
         )
 
 

@@ -57,7 +57,7 @@ class Options:
     out: OutputFile | None = None
     """Write the summary as JSON."""
     await_start: bool = False
-    """Print "ready" and the seconds of a frame, then read the time of the start (ns since 1970) and the rate from the input."""
+    """Print "ready" and the seconds of a frame, then read the time of the start (TAI, ns since 1970) and the rate."""
     network: NetworkOptions = field(default_factory=NetworkOptions)
     """The network."""
     security: SecurityOptions = field(default_factory=SecurityOptions)
@@ -106,7 +106,7 @@ def main(options: Options) -> None:
 def _wait_for_start(options: Options, agent: Agent, first: AgentFrame) -> LiveClock:
     """Warm up with the first frame, and return the clock, whose start is when the others start too."""
     from manyeyes.agents.agent import Agent
-    from manyeyes.runtime.clock import LiveClock
+    from manyeyes.runtime.clock import LiveClock, read_tai_ns
 
     took = 0.0
     # The first of two frames compiles and allocates.
@@ -116,7 +116,7 @@ def _wait_for_start(options: Options, agent: Agent, first: AgentFrame) -> LiveCl
         probe.perceive(first, probe.share(first))
         took = time.perf_counter() - began
     if not options.await_start:
-        return LiveClock(time.time_ns() + START_DELAY_NS, options.rate)
+        return LiveClock(read_tai_ns() + START_DELAY_NS, options.rate)
     sys.stdout.write(f"{READY} {took:.4f}\n")
     sys.stdout.flush()
     words = sys.stdin.readline().split()
