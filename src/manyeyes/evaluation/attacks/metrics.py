@@ -1,0 +1,199 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Metrics of attacks and defences, from records of drives.
+
+Definitions:
+
+- *sender-minute*: a minute of frames in which one ego received messages of one honest sender.
+- *false accusation*: an honest sender becomes named; it counts once until it is no longer named. The rate is per honest
+  sender-minute, with the exact Poisson bounds of Garwood (Biometrika 1936).
+- *detection rate within k frames*: fraction of malicious senders that are named in one of the first k frames of the attack, with
+  the interval of Clopper and Pearson (Biometrika 1934).
+- *time to detection*: number of the frame, from 1, in which a malicious sender is named first; none if it never is.
+- *ROC*: senders in frames, ranked by 1 - trust; malicious ones are positive.
+- *survival*: fraction of sent false claims on which a box of at least MIN_SCORE rests, by whether the claim is checkable
+  (``evaluation.attacks.sight``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import beta, chi2
+
+from manyeyes.evaluation.attacks.records import NO_EVIDENCE, ClaimRecord, DriveRecord, SenderRecord
+from manyeyes.evaluation.attacks.sight import is_checkable
+
+CONFIDENCE_LEVEL = 0.95
+MIN_SCORE = 0.5
+FIRST_FRAMES = (5, 10)
+NUM_ROC_POINTS = 101
+
+
+@dataclass(frozen=True)
+class Proportion:
+    """successes of total, with the Clopper-Pearson interval; NaN-free: 0 to 1 without trials."""
+
+    successes: int
+    total: int
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, successes: int, total: int) -> Proportion:
+        """Return the proportion with its two-sided interval."""
+        tail = (1 - CONFIDENCE_LEVEL) / 2
+        low = float(beta.ppf(tail, successes, total - successes + 1)) if successes else 0.0
+        high = float(beta.ppf(1 - tail, successes + 1, total - successes)) if successes < total else 1.0
+        return cls(successes, total, low, high)
+
+    @property
+    def value(self) -> float:
+        """The observed fraction; NaN without trials."""
+        return self.successes / self.total if self.total else float("nan")
+
+
+@dataclass(frozen=True)
+class EventRate:
+    """Events per minute in so many minutes, with Poisson bounds: low and high two-sided, upper one-sided."""
+
+    events: int
+    minutes: float
+    low: float
+    high: float
+    upper: float
+
+    @classmethod
+    def of(cls, events: int, minutes: float) -> EventRate:
+        """Return the rate; bounds are infinite without time."""
+        if minutes <= 0:
+            return cls(events, minutes, 0.0, float("inf"), float("inf"))
+        tail = (1 - CONFIDENCE_LEVEL) / 2
+        low = float(chi2.ppf(tail, 2 * events)) / 2 if events else 0.0
+        high, upper = (float(chi2.ppf(1 - p, 2 * events + 2)) / 2 for p in (tail, 1 - CONFIDENCE_LEVEL))
+        return cls(events, minutes, low / minutes, high / minutes, upper / minutes)
+
+    @property
+    def value(self) -> float:
+        """Events per minute; NaN without time."""
+        return self.events / self.minutes if self.minutes > 0 else float("nan")
+
+
+@dataclass(frozen=True)
+class RocCurve:
+    """false_positive and true_positive rates at falling thresholds, from 0 to 1; area under it, and the numbers of both classes."""
+
+    false_positive: tuple[float, ...]
+    true_positive: tuple[float, ...]
+    area: float
+    num_positive: int
+    num_negative: int
+
+
+def count_false_accusations(drives: Sequence[DriveRecord]) -> EventRate:
+    """Return the rate of false accusations per honest sender-minute."""
+    events, minutes = 0, 0.0
+    for drive in drives:
+        for sender in drive.senders:
+            if not sender.is_malicious:
+                named = sender.is_named.numpy().astype(np.int64)
+                events += int((np.diff(named, prepend=0) > 0).sum())
+                minutes += float(sender.is_received.sum()) * drive.frame_s / 60
+    return EventRate.of(events, minutes)
+
+
+def first_named(sender: SenderRecord) -> int | None:
+    """Return the number of the frame, from 1, in which a sender is named first; None if it is not."""
+    named = sender.is_named.nonzero()
+    return int(named[0]) + 1 if len(named) else None
+
+
+def times_to_detection(drives: Sequence[DriveRecord], checkable: bool = False) -> tuple[int | None, ...]:
+    """Return the time to detection of each malicious sender that was received; checkable: of those with a checkable claim."""
+    return tuple(
+        first_named(sender)
+        for drive in drives
+        for sender in drive.senders
+        if sender.is_malicious and bool(sender.is_received.any())
+        if not checkable or has_checkable_claim(drive, sender)
+    )
+
+
+def detection_rate(times: Sequence[int | None], num_frames: int) -> Proportion:
+    """Return the fraction of senders that are named within the first frames."""
+    return Proportion.of(sum(at is not None and at <= num_frames for at in times), len(times))
+
+
+def has_checkable_claim(drive: DriveRecord, sender: SenderRecord) -> bool:
+    """Return whether one of a sender's false claims can be checked by an honest agent."""
+    return any(
+        is_claim_checkable(claim) for claim in drive.claims if (claim.ego, claim.sender) == (sender.ego, sender.sender)
+    )
+
+
+def is_claim_checkable(claim: ClaimRecord) -> bool:
+    """Return whether enough rays cross a claim while it is sent, and nothing real is near."""
+    rays = np.where(claim.is_sent.numpy(), claim.num_rays.numpy(), 0)
+    return not claim.is_near_real and is_checkable(rays)
+
+
+@dataclass(frozen=True)
+class Survival:
+    """False claims on which a box of MIN_SCORE rests, of those sent, frame by frame; num_frames: evaluated with a false claim.
+
+    marked: of the surviving ones, with any evidence stated; trusted: of the surviving ones, of senders of at least MIN_TRUST.
+    """
+
+    surviving: Proportion
+    marked: Proportion
+    trusted: Proportion
+    num_frames: int
+
+    @property
+    def per_frame(self) -> float:
+        """Surviving false claims in a frame; NaN without frames."""
+        return self.surviving.successes / self.num_frames if self.num_frames else float("nan")
+
+
+MIN_TRUST = 0.8
+
+
+def measure_survival(drives: Sequence[DriveRecord], checkable: bool) -> Survival:
+    """Return the survival of the checkable or of the other false claims; those near real objects are left out."""
+    sent = surviving = marked = trusted = frames = 0
+    for drive in drives:
+        claims = [c for c in drive.claims if not c.is_near_real and is_claim_checkable(c) == checkable]
+        for claim in claims:
+            is_sent = claim.is_sent.numpy()
+            survives = is_sent & (claim.score.numpy() >= MIN_SCORE)
+            sent, surviving = sent + int(is_sent.sum()), surviving + int(survives.sum())
+            marked += int((survives & (claim.evidence.numpy() != NO_EVIDENCE)).sum())
+            trusted += int((survives & (claim.trust.numpy() >= MIN_TRUST)).sum())
+        if claims:
+            frames += int(np.any([claim.is_sent.numpy() for claim in claims], axis=0).sum())
+    return Survival(
+        Proportion.of(surviving, sent), Proportion.of(marked, surviving), Proportion.of(trusted, surviving), frames
+    )
+
+
+def make_roc(drives: Sequence[DriveRecord]) -> RocCurve | None:
+    """Return the ROC of 1 - trust over senders in frames; None where one class is empty."""
+    suspicion, positive = [np.zeros(0)], [np.zeros(0, dtype=bool)]
+    for drive in drives:
+        for sender in drive.senders:
+            received = sender.is_received.numpy()
+            suspicion.append(1 - sender.trust.numpy()[received])
+            positive.append(np.full(int(received.sum()), sender.is_malicious))
+    score, is_positive = np.concatenate(suspicion), np.concatenate(positive)
+    num_positive, num_negative = int(is_positive.sum()), int((~is_positive).sum())
+    if not num_positive or not num_negative:
+        return None
+    order = np.argsort(-score, kind="stable")
+    ends = np.append(np.flatnonzero(np.diff(score[order])), len(score) - 1)
+    true_positive = np.append(0, np.cumsum(is_positive[order])[ends] / num_positive)
+    false_positive = np.append(0, np.cumsum(~is_positive[order])[ends] / num_negative)
+    area = float(np.sum(np.diff(false_positive) * (true_positive[1:] + true_positive[:-1]) / 2))
+    x = np.linspace(0, 1, NUM_ROC_POINTS)
+    last = np.searchsorted(false_positive, x, side="right") - 1
+    return RocCurve(tuple(x.tolist()), tuple(true_positive[last].tolist()), area, num_positive, num_negative)
