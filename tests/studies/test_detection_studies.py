@@ -307,6 +307,24 @@ def test_budgets_are_respected_and_small_ones_send_less(data, weights, tmp_path)
 
 
 @pytest.mark.slow
+def test_every_method_has_a_curve_over_budgets_of_its_own(data, weights, tmp_path, panels) -> None:
+    words = ("--frame-stride", 2, "--methods", "no-fusion", "late", "intermediate", "early")
+    rows = evaluate(data, weights, tmp_path, "byte-curves", *words, "--budgets", 1398, 400, "all")["result"]["rows"]
+    assert [(r["method"], r["budget_bytes"]) for r in rows] == [
+        ("no-fusion", None),
+        *((m, b) for m in ("late", "intermediate", "early") for b in (400, 1398, None)),
+    ]
+    for row in rows[1:]:
+        assert row["budget_bytes"] is None or row["max_message_bytes"] <= row["budget_bytes"]
+    sizes = [r["bytes_per_message"] for r in rows]
+    assert sizes[0] == 0 and all(sizes[k] <= sizes[k + 1] <= sizes[k + 2] for k in (1, 4, 7)) and sizes[7] < sizes[9]
+    assert [(p.ylabel, p.in_bytes, [len(c.x) for c in p.curves]) for p in panels] == [
+        ("AP@0.5", True, [0, 3, 3, 3]), ("AP@0.7", True, [0, 3, 3, 3]),
+    ]  # fmt: skip
+    assert rows[5]["command"].endswith("--budgets 1398 --rows intermediate")
+
+
+@pytest.mark.slow
 def test_numbers_of_agents_are_evaluated_on_scenarios_that_have_them(data, weights, tmp_path, panels) -> None:
     words = ("--methods", "no-fusion", "late", "--frame-stride", 2)
     rows = evaluate(data, weights, tmp_path, "num-agents", *words)["result"]["rows"]
@@ -390,6 +408,9 @@ def test_no_fusion_is_the_same_under_every_perturbation(data, weights) -> None:
         (("bandwidth", "--token-encodings", "moon"), ("moon", "float16")),
         (("bandwidth", "--token-selection", "moon"), ("moon", "intermediate")),
         (("ablation",), ("name=weights.safetensors",)),
+        (("byte-curves", "--budgets", "0"), ("--budgets takes numbers of bytes",)),
+        (("byte-curves", "--rows", "moon"), ("no row 'moon'", "intermediate-temporal")),
+        (("main-table", "--checkpoints", "late=x"), ("methods of the names late",)),
         (("ablation", "--checkpoints", "a=x", "a=y"), ("each name once",)),
     ],
 )

@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 from manyeyes.agents.agent import Agent, Perception
+from manyeyes.agents.content_budget import BudgetedStrategy
 from manyeyes.agents.exchange import Exchange
 from manyeyes.agents.perception_cache import HISTORY_FRAMES, TRACK_FRAMES, AgentOutput, PerceptionCache
 from manyeyes.agents.pose_correction import PoseCorrection
-from manyeyes.agents.strategies.registry import get_strategy
+from manyeyes.agents.strategies.registry import FusionStrategy, get_strategy
 from manyeyes.agents.trust.interface import MisbehaviourDetector
 from manyeyes.comms.bandwidth import allocate_max_min_fair
 from manyeyes.comms.channel import ChannelPreset, channel_preset
@@ -41,6 +42,7 @@ class ReplayConfig:
     instant, allocated by ``comms.bandwidth.allocate_max_min_fair`` from what each agent would send without a limit, as by a central
     scheduler. send_request_map: messages with tokens carry a request map, and received request maps weight the token scores.
     pose_correction: of received messages; None uses their prior poses. misbehaviour: of all agents; None trusts every sender.
+    limits_contents: budget_bytes limits boxes and points too (``agents.content_budget``), not tokens alone.
     """
 
     channel: str | ChannelPreset = "ideal"
@@ -55,6 +57,7 @@ class ReplayConfig:
     send_request_map: bool = False
     pose_correction: PoseCorrection | None = None
     misbehaviour: MisbehaviourDetector | None = None
+    limits_contents: bool = False
 
     @property
     def radio(self) -> ChannelPreset:
@@ -186,7 +189,7 @@ class DetectionReplay:
             config = self.config
             self._agents[agent_id] = Agent(
                 self.detector,
-                get_strategy(self.method),
+                self._make_strategy(),
                 config.token_encoding,
                 config.budget_bytes,
                 PerceptionCache(self.detector, feature_cache=self.feature_cache),
@@ -195,6 +198,10 @@ class DetectionReplay:
                 misbehaviour=config.misbehaviour,
             )
         return self._agents[agent_id]
+
+    def _make_strategy(self) -> FusionStrategy:
+        strategy, budget = get_strategy(self.method), self.config.budget_bytes
+        return strategy if budget is None or not self.config.limits_contents else BudgetedStrategy(strategy, budget)
 
     def _make_inbox(self, agent_id: int) -> Inbox:
         return self._agent(agent_id).inbox(EXPIRE_NS)

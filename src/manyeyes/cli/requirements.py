@@ -130,6 +130,7 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
     "study main-table": (),
     "study robustness": (_MATPLOTLIB,),
     "study bandwidth": (_MATPLOTLIB,),
+    "study byte-curves": (_MATPLOTLIB,),
     "study shared-bandwidth": (_MATPLOTLIB,),
     "study num-agents": (_MATPLOTLIB,),
     "study sensors": (_MATPLOTLIB,),

@@ -35,6 +35,9 @@ STUDIES = {
     "bandwidth": Study(
         _DETECTION, "AP against bytes per message, by token selection and encoding (Fig. 3)",
         "detection.bandwidth", "BandwidthOptions"),
+    "byte-curves": Study(
+        _DETECTION, "AP against bytes per message, for every method and baseline (Fig. 3)",
+        "detection.byte_curves", "ByteCurvesOptions"),
     "shared-bandwidth": Study(
         _DETECTION, "every agent as ego, one budget for the channel (Eq. 2)",
         "detection.shared_bandwidth", "SharedBandwidthOptions"),

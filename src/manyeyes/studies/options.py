@@ -87,6 +87,20 @@ class MainTableOptions(EvaluationOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ByteCurvesOptions(EvaluationOptions):
+    """Options of the study byte-curves; its budgets take the place of --budget-bytes."""
+
+    replay_options: ReplayOptions = field(default_factory=lambda: ReplayOptions(methods=BOTH_FORMS))
+    """How agents collaborate."""
+    budgets: tuple[str, ...] = ()
+    """Most bytes of a message, and "all" for no budget; by default those of the study for tokens, boxes and points."""
+    checkpoints: tuple[str, ...] = ()
+    """Baselines with weights of their own, as NAME=weights.safetensors[@STRATEGY[@CORRECTOR]], in the forms of intermediate."""
+    rows: tuple[str, ...] = ()
+    """Only these methods and baselines, by name."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class SensorsOptions(EvaluationOptions):
     """Options of the study sensors."""
 
