@@ -39,7 +39,7 @@ from manyeyes.simulator.fleet.landmarks import LandmarkScene, LandmarkSpec, make
 from manyeyes.studies.provenance import write_json
 
 NOISY = BoxNoise(0.45, np.radians(4.0), 0.10, 0.3)
-GUESS = CorrectorConfig(accept=AcceptanceTest(-1e9, 0.0, 1, 0.0))
+GUESS = CorrectorConfig(accept=AcceptanceTest(-1e9, min_margin=0.0, min_pairs=1, runner_up_margin_pairs=0.0))
 
 
 @dataclass(frozen=True)

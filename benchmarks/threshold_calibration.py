@@ -39,14 +39,18 @@ def calibrate_acceptance(
             f"got {len(scores)}. Give more scenes or allow more."
         )
     # Just above the best scene that must be rejected.
-    min_score = math.nextafter(max(scores[allowed], 0.0), math.inf)
+    min_score = scores[allowed] + 1e-9 if math.isfinite(scores[allowed]) else 0.0
     return replace(config.accept, min_score=min_score)
 
 
 def _required_min_score(ego: Landmarks, other: Landmarks, config: CorrectorConfig) -> float:
     """Return the min_score above which this scene gets no estimate; minus infinity where other limits already reject it."""
-    extra_score = config.accept.extra_score_per_instant * max(len(np.unique(ego.instant)) - 1, 0)
-    ranked = rank_candidates(find_candidates(ego, other, config.vote), None, config.accept.prior_volume)
-    if ranked is None or ranked.margin < config.accept.min_margin:
+    accept = config.accept
+    ranked = rank_candidates(find_candidates(ego, other, config.vote), None, accept.prior_volume)
+    if ranked is None:
         return -math.inf
+    mean_pair_score = ranked.best.score / len(ranked.best.pairs)
+    if ranked.margin < max(accept.min_margin, accept.runner_up_margin_pairs * mean_pair_score):
+        return -math.inf
+    extra_score = accept.required_score(ranked.best.num_compared, len(np.unique(ego.instant))) - accept.min_score
     return ranked.score - extra_score if len(ranked.best.pairs) >= config.accept.min_pairs else -math.inf

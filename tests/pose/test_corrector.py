@@ -124,10 +124,9 @@ def test_conflict_margin_applies_to_candidates_that_contradict_the_prior():
     assert plain.status is PoseStatus.CONFLICT
     ranked = rank_candidates(find_candidates(ego, other, VoteConfig(), wrong), wrong, AcceptanceTest().prior_volume)
     for more, status in ((0.9, PoseStatus.CONFLICT), (1.1, PoseStatus.NO_MATCH)):
-        enough = more * (ranked.score - AcceptanceTest().min_score)
-        asked = correct_by_voting(
-            ego, other, wrong, CorrectorConfig(accept=AcceptanceTest(conflict_margin=enough, min_margin=0.0))
-        )
+        enough = more * (ranked.score - AcceptanceTest().required_score(ranked.best.num_compared))
+        accept = AcceptanceTest(conflict_margin=enough, min_margin=0.0, runner_up_margin_pairs=0.0)
+        asked = correct_by_voting(ego, other, wrong, CorrectorConfig(accept=accept))
         assert asked.status is status
     # A prior that objects agree with needs no such margin.
     right = make_prior(made.ego_from_other)

@@ -5,11 +5,11 @@ import math
 
 import numpy as np
 import pytest
-from benchmarks.landmark_scenes import LandmarkSpec, make_landmark_scene
 
 from manyeyes.pose import _voting_kernels as loops
 from manyeyes.pose.corrector import _prior_log_ratios, mahalanobis_squared
 from manyeyes.pose.landmarks import Landmarks
+from manyeyes.pose.size_evidence import compute_size_evidence
 from manyeyes.pose.types import PosePrior
 from manyeyes.pose.voting import (
     Candidate,
@@ -22,6 +22,7 @@ from manyeyes.pose.voting import (
     _with_place_covariance,
     find_candidates,
 )
+from manyeyes.simulator.fleet.landmarks import LandmarkSpec, make_landmark_scene
 
 CONFIG = VoteConfig()
 
@@ -140,17 +141,17 @@ def test_refined_poses_are_ranked_by_the_sum_of_their_pairs_evidence():
     exact = _with_place_covariance(a, 1.0), _with_place_covariance(b, 1.0)
     starts = np.concatenate((_hypotheses(a, b, is_compatible, CONFIG)[::7][:12], [[500.0, 0.0, 0.0]]))
     refined = loops.refine_poses(starts, *exact, is_compatible, 1.0, CONFIG.pair_gate, 14)
-    wanted = []
+    wanted, sizes = [], compute_size_evidence(a, b)
     for start in starts:
         pose, information, pairs, misfit = loops.refine_pose(start, *exact, is_compatible, 1.0, CONFIG.pair_gate, 14)
         score = 0.0
         for (i, k), square in zip(pairs, misfit):
             variance = a.sigma_xy[i] ** 2 + b.sigma_xy[k] ** 2
-            gain = max(math.log(CONFIG.chance_area_m2 / (2 * math.pi * variance)) - square / 2, 0.0)
+            gain = math.log(CONFIG.chance_area_m2 / (2 * math.pi * variance)) - square / 2 + sizes[i, k]
             flip_a, flip_b = (min(max(p, 0.01), 0.5) for p in (a.p_flip[i], b.p_flip[k]))
             agree = (1 - flip_a) * (1 - flip_b) + flip_a * flip_b
             same = math.cos(a.yaw[i] - b.yaw[k] - pose[2]) > 0
-            score += gain + math.log(2 * (agree if same else 1 - agree))
+            score += max(gain, 0.0) + math.log(2 * (agree if same else 1 - agree))
         wanted += [(pose, information, pairs, misfit, score)] if len(pairs) else []
     wanted.sort(key=lambda f: -f[4])
     found = _rank_refined(a, b, refined, CONFIG)
@@ -198,7 +199,7 @@ def test_covariances_of_candidates_are_scaled_inverse_information():
     for pairs in (1, 4, 9):
         root = rng.normal(size=(3, 3))
         found.append((np.zeros(3), root @ root.T + np.eye(3), np.zeros((pairs, 2), int), rng.random(pairs) * 5, 1.0))
-    for one, covariance in zip(found, _covariances(found, config)):
+    for one, covariance in zip(found, _covariances(found, Landmarks.empty(), config)):
         pairs, misfit = len(one[2]), one[3].sum()
         wanted = np.linalg.inv(one[1]) * (10.0 + misfit) / (10.0 + 3 * pairs - 3)
         wanted[0, 0] += 0.05 * pairs * 2 / (one[1][0, 0] + one[1][1, 1])

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The default corrector: accept or reject the best candidate pose, and fuse it with the prior.
 
-A candidate is accepted by its log-likelihood ratio against chance and by its margin over the best distinct other candidate.
-The limits are calibrated on pairs of agents without common objects (benchmarks, threshold_calibration). A prior raises the score of
+A candidate is accepted by its log-likelihood ratio against chance and by its margin over the best distinct other candidate. The
+score that chance reaches grows with the logarithm of the number of pairs that were compared, and so does the limit. Limits are
+calibrated on pairs of agents without common objects, of several densities (benchmarks/pose_real.py). A prior raises the score of
 candidates near it by the logarithm of its density over that of a uniform pose, and never lowers a score. The accepted
 candidate is compared with the prior by the squared Mahalanobis distance, a chi^2 test with 3 degrees of freedom. Below
 p = 0.05 the two are fused by their information. Below p = 0.001 the prior is not used. In between its covariance is
@@ -42,16 +43,18 @@ CHI2_3DOF_P05, CHI2_3DOF_P001 = 7.815, 16.266
 class AcceptanceTest:
     """Limits for accepting a candidate.
 
-    min_score: log-likelihood ratio against chance; min_margin: over the best distinct other candidate. min_pairs: pairs, where
-    no prior supports the candidate. runner_up_margin_pairs: a runner-up that passes min_score must have so many (mean) pairs less,
-    since an evenly spaced queue shifted by one place loses only one pair. prior_volume: volume (m^2 rad) of a uniform pose,
-    100 m around with any yaw. conflict_margin: additional score and margin for a candidate that conflicts with the prior.
+    min_score, score_per_log_pair: the log-likelihood ratio against chance needs min_score + score_per_log_pair ln(num_compared).
+    min_margin: over the best distinct other candidate; runner_up_margin_pairs: and at least so many times the mean score of a
+    pair, since an evenly spaced queue shifted by one place loses only one pair. min_pairs: pairs, where no prior supports the
+    candidate. prior_volume: volume (m^2 rad) of a uniform pose, 100 m around with any yaw. conflict_margin: additional score and
+    margin for a candidate that conflicts with the prior.
     """
 
-    min_score: float = 24.0
+    min_score: float = 6.5
+    score_per_log_pair: float = 3.5
     min_margin: float = 3.0
     min_pairs: int = 3
-    runner_up_margin_pairs: float = 2.0
+    runner_up_margin_pairs: float = 1.5
     extra_score_per_instant: float = 4.0
     prior_volume: float = 2.0e5
     conflict_margin: float = 0.0
@@ -63,8 +66,15 @@ class AcceptanceTest:
             raise ConfigError(
                 "AcceptanceTest needs a finite min_score, min_margin >= 0, min_pairs >= 1 and prior_volume > 0."
             )
+        if not min(self.score_per_log_pair, self.runner_up_margin_pairs) >= 0:
+            raise ConfigError("AcceptanceTest needs score_per_log_pair and runner_up_margin_pairs of at least 0.")
         if not self.conflict_margin >= 0:
             raise ConfigError(f"AcceptanceTest needs conflict_margin >= 0; got {self.conflict_margin}.")
+
+    def required_score(self, num_compared: int, num_instants: int = 1) -> float:
+        """Return the score that a candidate needs: of so many compared pairs of landmarks in so many instants."""
+        extra_score = self.extra_score_per_instant * max(num_instants - 1, 0)
+        return self.min_score + self.score_per_log_pair * math.log(num_compared) + extra_score
 
 
 @dataclass(frozen=True)
@@ -76,10 +86,18 @@ class CorrectorConfig:
 
 
 DETECTOR_BOXES_CONFIG = CorrectorConfig(
-    VoteConfig(common_variance_fraction=0.05, lateral_sigma_ratio=0.6), AcceptanceTest(conflict_margin=5.0)
+    VoteConfig(
+        common_variance_fraction=0.05,
+        lateral_sigma_ratio=0.6,
+        few_pairs_inflation=2.0,
+        floor_xy_m=0.07,
+        floor_yaw_rad=math.radians(0.15),
+    ),
+    AcceptanceTest(conflict_margin=5.0),
 )
-"""For boxes of detectors: errors of one view are correlated, since a sensor observes one side of a vehicle, and longitudinal errors
-are larger than lateral ones, since the far end is seldom observed. Vehicles in a queue agree by chance (docs/pose/index.md).
+"""For boxes of detectors: errors of one view are correlated, since a sensor observes one side of a vehicle, longitudinal errors are
+larger than lateral ones, since the far end is seldom observed, and their tails are heavy. Vehicles in a queue agree by chance
+(docs/pose/index.md).
 """
 
 
@@ -122,7 +140,6 @@ def decide(
     found: list[Candidate], prior: PosePrior | None, acceptance: AcceptanceTest, num_instants: int = 1
 ) -> PoseEstimate:
     """Accept or reject the best candidate, and fuse it with the prior. num_instants: number of frames of the landmarks."""
-    min_score = acceptance.min_score + acceptance.extra_score_per_instant * max(num_instants - 1, 0)
     ranked = rank_candidates(found, prior, acceptance.prior_volume)
     if ranked is None:
         return no_estimate(prior)
@@ -130,15 +147,11 @@ def decide(
     prior_agrees = _prior_log_ratios([best], prior, acceptance.prior_volume)[0] > 0
     is_conflict = prior is not None and mahalanobis_squared(best.pose, best.covariance, prior) > CHI2_3DOF_P001
     extra_margin = acceptance.conflict_margin if is_conflict else 0.0
-    if ranked.score < min_score + extra_margin or len(best.pairs) < (1 if prior_agrees else acceptance.min_pairs):
+    min_score = acceptance.required_score(best.num_compared, num_instants) + extra_margin
+    if ranked.score < min_score or len(best.pairs) < (1 if prior_agrees else acceptance.min_pairs):
         return replace(no_estimate(prior), inliers=len(best.pairs), runner_up=ranked.runner_up, margin=ranked.margin)
-    has_plausible_runner_up = ranked.score - ranked.margin >= min_score
-    required_margin = (
-        acceptance.runner_up_margin_pairs * best.score / len(best.pairs)
-        if has_plausible_runner_up
-        else acceptance.min_margin
-    )
-    if ranked.margin < max(required_margin, acceptance.min_margin) + extra_margin:
+    mean_pair_score = best.score / len(best.pairs)
+    if ranked.margin < max(acceptance.runner_up_margin_pairs * mean_pair_score, acceptance.min_margin) + extra_margin:
         estimate = no_estimate(prior, PoseStatus.AMBIGUOUS)
         return replace(
             estimate, inliers=len(best.pairs), runner_up=ranked.runner_up, margin=ranked.margin, pairs=best.pairs

@@ -24,12 +24,12 @@ SIZE_RANGE_M = (0.2, 30.0)
 @dataclass(frozen=True)
 class DetectorUncertainty:
     """Errors of a detector that states none of its own: one standard deviation per axis (m), of the heading modulo pi (rad), and
-    the probability that the heading is off by pi. The defaults are 0.25 m, 2.5 degrees and 3 %.
+    the probability that the heading is off by pi. The defaults are 0.25 m, 4 degrees and 6 %, as measured on pairs of real boxes.
     """
 
     sigma_xy_m: float = 0.25
-    sigma_yaw_rad: float = 0.044
-    p_flip: float = 0.03
+    sigma_yaw_rad: float = 0.07
+    p_flip: float = 0.06
 
     def __post_init__(self) -> None:
         if not (self.sigma_xy_m > 0 and self.sigma_yaw_rad > 0 and 0 <= self.p_flip <= 0.5):

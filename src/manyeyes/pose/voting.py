@@ -4,13 +4,14 @@
 Pairs of objects vote (_voting_kernels), the best supported poses are refined on one-to-one pairs, and each is scored by a
 log-likelihood ratio: pairs are the same objects, against pairs that met by chance. A pair gains log(area / 2 pi s^2) less
 half its squared residual, ``area`` being the mean ground per chance neighbour, and log 2p for a heading that agrees with
-probability p. The result does not depend on the order of landmarks nor on which agent is called ego.
+probability p, and the evidence of their sizes (size_evidence.py). The result does not depend on the order of landmarks nor on which
+agent is called ego.
 """
 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ from numpy.typing import NDArray
 from manyeyes.datatypes import ConfigError
 from manyeyes.pose import _voting_kernels as loops
 from manyeyes.pose.landmarks import Landmarks
+from manyeyes.pose.sensor_clutter import IdentityFilter, find_sensor_fixed
+from manyeyes.pose.size_evidence import compute_size_evidence
 from manyeyes.pose.types import PosePrior
 
 Floats = NDArray[np.float64]
@@ -38,6 +41,9 @@ class VoteConfig:
     between instants count once. prior_dof: degrees of freedom of the stated errors against those of the residuals.
     common_variance_fraction: fraction of a box's variance that all boxes of one view have in common, which does not average
     out. lateral_sigma_ratio: lateral error of a box over its longitudinal error, which is the one that landmarks state.
+    few_pairs_inflation: the covariance of P pairs is larger by 1 + few_pairs_inflation / P, since errors have heavy tails.
+    floor_xy_m, floor_yaw_rad: errors that all boxes have in common, added at the centre of the pairs. identity_filter: removes
+    landmarks that are fixed to the sensors.
     """
 
     max_range_m: float = 300.0
@@ -59,6 +65,10 @@ class VoteConfig:
     prior_dof: float = 10.0
     common_variance_fraction: float = 0.0
     lateral_sigma_ratio: float = 1.0
+    few_pairs_inflation: float = 0.0
+    floor_xy_m: float = 0.0
+    floor_yaw_rad: float = 0.0
+    identity_filter: IdentityFilter = field(default_factory=IdentityFilter)
 
     def __post_init__(self) -> None:
         if (
@@ -70,12 +80,15 @@ class VoteConfig:
             raise ConfigError(
                 "VoteConfig needs prior_dof > 0, common_variance_fraction in [0, 1) and lateral_sigma_ratio in (0, 1]."
             )
+        if min(self.few_pairs_inflation, self.floor_xy_m, self.floor_yaw_rad) < 0:
+            raise ConfigError("VoteConfig needs few_pairs_inflation, floor_xy_m and floor_yaw_rad of at least 0.")
 
 
 @dataclass(frozen=True)
 class Candidate:
     """A candidate ego_from_other (3,): its covariance (3, 3) in the ego's axes, pairs (P, 2) of rows, the log-likelihood ratio,
-    and the squared residual of all pairs with its degrees of freedom.
+    and the squared residual of all pairs with its degrees of freedom. num_compared: number of pairs of landmarks of one instant,
+    with which the score that chance reaches grows.
     """
 
     pose: Floats
@@ -84,6 +97,7 @@ class Candidate:
     score: float
     chi2: float
     dof: int
+    num_compared: int = 1
 
 
 def find_candidates(
@@ -91,6 +105,10 @@ def find_candidates(
 ) -> list[Candidate]:
     """Find distinct poses ego_from_other, most likely first. The prior is one more hypothesis; it does not change scores."""
     rows_e, rows_o = (x.select_indices(config.max_range_m, config.max_landmarks) for x in (ego, other))
+    clutter = config.identity_filter
+    fixed = None if clutter.is_plausible(prior) else find_sensor_fixed(ego[rows_e], other[rows_o], clutter)
+    if fixed is not None:
+        rows_e, rows_o = rows_e[~fixed[0]], rows_o[~fixed[1]]
     if not len(rows_e) or not len(rows_o):
         return []
     a, b = ego[rows_e], other[rows_o]
@@ -98,19 +116,28 @@ def find_candidates(
     # From the smaller set to the larger, so that exchanging the agents gives the inverse to the last digit but rounding.
     swapped = _rank(a) < _rank(b)
     if swapped:
-        found = _search(b, a, config, None if start is None else _inverse(start))
-    else:
-        found = _search(a, b, config, start)
+        a, b, start = b, a, None if start is None else _inverse(start)
+    found = _search(a, b, config, start)
+    if fixed is not None:
+        found = [one for one in found if not clutter.is_identity(one[0][None])[0]]
     if not found:
         return []
-    out = []
-    for (pose, _, pairs, misfit, score), covariance in zip(found, _covariances(found, config)):
+    out, num_compared = [], _count_comparable(a, b)
+    for (pose, _, pairs, misfit, score), covariance in zip(found, _covariances(found, a, config)):
         if swapped:
             pose, covariance, pairs = *_invert(pose, covariance), pairs[:, ::-1]
         rows = np.stack((rows_e[pairs[:, 0]], rows_o[pairs[:, 1]]), 1)
         total, dof = float(misfit.sum()), 3 * len(pairs) - 3
-        out.append(Candidate(pose, (covariance + covariance.T) / 2, rows[np.lexsort(rows.T)], score, total, dof))
+        covariance, rows = (covariance + covariance.T) / 2, rows[np.lexsort(rows.T)]
+        out.append(Candidate(pose, covariance, rows, score, total, dof, num_compared))
     return out
+
+
+def _count_comparable(a: Landmarks, b: Landmarks) -> int:
+    """Return the number of pairs of landmarks of one instant, at least 1."""
+    counts = [np.bincount(x.instant - min(a.instant.min(), b.instant.min())) for x in (a, b)]
+    shared = min(map(len, counts))
+    return max(int(counts[0][:shared] @ counts[1][:shared]), 1)
 
 
 _Found = tuple[Floats, Floats, Ints, Floats, float]
@@ -215,6 +242,7 @@ def _pair_gains(a: Landmarks, b: Landmarks, refined: loops.RefinedPoses, config:
     agree = (1 - flip_a) * (1 - flip_b) + flip_a * flip_b
     yaw = np.repeat(refined.poses[:, 2], np.diff(refined.start))
     same = np.cos(a.yaw[i] - b.yaw[k] - yaw) > 0
+    gain += compute_size_evidence(a, b)[i, k]
     return np.maximum(gain, 0.0) + np.log(2 * np.where(same, agree, 1 - agree))
 
 
@@ -250,18 +278,28 @@ def transform_point(poses: Floats, point: Floats) -> Floats:
     return poses[:, :2] + np.stack((c * point[0] - s * point[1], s * point[0] + c * point[1]), 1)
 
 
-def _covariances(found: list[_Found], config: VoteConfig) -> Floats:
+def _covariances(found: list[_Found], a: Landmarks, config: VoteConfig) -> Floats:
     """Return (K, 3, 3): inverse information, scaled by the residuals (the mean of an inverse gamma prior on the scale), plus the
-    variance that all boxes of a view have in common.
+    variance that all boxes of a view have in common, and the floor.
     """
     information = np.array([f[1] for f in found])
     misfit, pairs = np.array([(f[3].sum(), len(f[2])) for f in found]).T
-    scale = (config.prior_dof + misfit) / (config.prior_dof + 3 * pairs - 3)
+    scale = (config.prior_dof + misfit) / (config.prior_dof + 3 * pairs - 3) * (1 + config.few_pairs_inflation / pairs)
     covariance = np.asarray(np.linalg.inv(information) * scale[:, None, None], np.float64)
     # The first two of the diagonal sum the pairs' inverse variances along an axis.
     common = config.common_variance_fraction * pairs * 2 / (information[:, 0, 0] + information[:, 1, 1])
     covariance[:, [0, 1], [0, 1]] += common[:, None]
+    if config.floor_xy_m or config.floor_yaw_rad:
+        covariance += np.array([_covariance_floor(f[0], a.xy[f[2][:, 0]].mean(0), config) for f in found])
     return covariance
+
+
+def _covariance_floor(pose: Floats, centre: Floats, config: VoteConfig) -> Floats:
+    """Return (3, 3): common errors of all boxes, a shift and a turn about the centre (2,) of the pairs in a's frame."""
+    lever = np.array([centre[1] - pose[1], pose[0] - centre[0], 1.0])
+    floor = np.outer(lever, lever) * config.floor_yaw_rad**2
+    floor[[0, 1], [0, 1]] += config.floor_xy_m**2
+    return floor
 
 
 def _rank(x: Landmarks) -> tuple[float, ...]:
