@@ -65,6 +65,8 @@ def test_other_weights_send_no_clusters() -> None:
     detector = weights("max")
     with pytest.raises(ConfigError, match="ermvp"):
         Agent(detector, token_encoding="clusters")
-    agent = Agent(detector, get_strategy("intermediate-ermvp"))
-    with pytest.raises(ConfigError, match="ermvp"):
-        agent.share(Plane().snapshot("plane", 0).frames[1])
+    frame = Plane().snapshot("plane", 0).frames[1]
+    as_usual = Agent(detector, get_strategy("intermediate")).share(frame, 1398)
+    assert Agent(detector, get_strategy("intermediate-ermvp")).share(frame, 1398) == as_usual
+    with pytest.raises(ConfigError, match="no sampling score"):
+        detector.score_for_sampling(Agent(detector).perception_cache.process_tokens(frame).shared_tokens)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """ERMVP's sampling (Zhang et al., CVPR 2024): a byte budget keeps the clusters of the tokens of highest learned score.
 
-It needs weights of the fusion ``ermvp``, whose tokens every strategy sends as clusters; only the order under a budget differs.
+Weights of the fusion ``ermvp`` have that score, and send clusters with every strategy; others use the order of ``intermediate``.
 """
 
 from __future__ import annotations
@@ -13,16 +13,17 @@ from torch import Tensor
 
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.intermediate import IntermediateFusion
+from manyeyes.agents.strategies.redundancy import distinct_score
 from manyeyes.agents.strategies.registry import register_strategy
-from manyeyes.datatypes import AgentFrame, ConfigError
+from manyeyes.datatypes import AgentFrame
 from manyeyes.models.detector.detector import Detector
 
 
 def sampling_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
-    """Return the learned score (N,) of the shared tokens."""
+    """Return the learned score (N,) of the shared tokens; without one, that of ``intermediate``."""
     detector = cache.detector
-    if not isinstance(detector, Detector):
-        raise ConfigError("intermediate-ermvp needs weights of the fusion ermvp.")
+    if not isinstance(detector, Detector) or detector.cluster_form is None:
+        return distinct_score(cache, frame)
     with torch.inference_mode():
         return detector.score_for_sampling(cache.process_tokens(frame).shared_tokens)
 

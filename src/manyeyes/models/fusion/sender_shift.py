@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Estimate the pose error of each sender from its tokens, and move the tokens back before they are fused; ours.
+
+Peaks of the ego's and of a sender's tokens are proposed centres of objects. Pairs of them vote for a displacement; the pairs of its
+mode give position and yaw in closed form: least squares with a Gaussian prior, so that few pairs move little. Nothing is moved
+without enough pairs, with a second mode of almost as many votes, or where the estimate is within its own error. Headings of
+proposals and vector channels are not turned; errors of yaw are a degree or so.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+
+from manyeyes.models.detector.box_head import BOX_LAYOUT
+from manyeyes.models.detector.proposal import proposed_heat, proposed_offset
+from manyeyes.models.detector.transformer import AttentionConfig
+from manyeyes.models.fusion.registry import get_fusion, register_fusion
+from manyeyes.models.fusion.token_merge import DRIFT_MPS, MAX_OFFSET_CELLS
+from manyeyes.models.fusion.transform_tokens import Tokens
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ShiftConfig:
+    """Settings of the estimate.
+
+    Attributes:
+        min_score: peaks of lower confidence take no part.
+        peak_radius_m: a peak is the most confident token within this distance.
+        max_peaks: the most confident peaks of an agent that take part.
+        max_shift_m: largest displacement of a pair.
+        min_pairs: fewer pairs move nothing.
+        vote_m: width of the votes, for the error of centres and the turn by an error of yaw.
+        match_m: largest distance of a pair after the shift of the mode.
+        max_second: share of the best vote that a displacement apart from it may have.
+        object_sigma_m: error of the distance of two centres of one object, beside what proposals state.
+        prior_sigma_m: prior of the position error, each axis.
+        prior_sigma_yaw_rad: prior of the yaw error.
+        min_chi2: least squared length of the estimate in units of its own covariance.
+    """
+
+    min_score: float = 0.2
+    peak_radius_m: float = 2.0
+    max_peaks: int = 48
+    max_shift_m: float = 2.5
+    min_pairs: int = 3
+    vote_m: float = 0.5
+    match_m: float = 1.25
+    max_second: float = 0.8
+    object_sigma_m: float = 0.3
+    prior_sigma_m: float = 1.0
+    prior_sigma_yaw_rad: float = 0.014
+    min_chi2: float = 2.0
+
+
+DEFAULT_SHIFT = ShiftConfig()
+
+
+@dataclass(frozen=True, eq=False)
+class Peaks:
+    """Proposed objects of one agent: centre (n, 2), metres; weight (n,), confidence; sigma (n,) of the centre, metres."""
+
+    center: F64
+    weight: F64
+    sigma: F64
+
+
+@dataclass(frozen=True, eq=False)
+class SenderShift:
+    """Estimated correction of a sender: p becomes p + shift + yaw J (p - origin), J a quarter turn to the left.
+
+    covariance: (3, 3) of x, y, yaw after the correction. num_pairs: that it rests on.
+    """
+
+    shift: F64
+    yaw: float
+    origin: F64
+    covariance: F64
+    num_pairs: int
+
+    def move(self, xy: F64) -> F64:
+        """Return corrected positions (n, 2)."""
+        arm = xy - self.origin
+        return xy + self.shift + self.yaw * np.stack((-arm[:, 1], arm[:, 0]), 1)
+
+    def sigma_m(self, xy: F64) -> F64:
+        """Return the standard deviation (n,) of corrected positions, the mean of both axes."""
+        arm = xy - self.origin
+        of_xy = (self.covariance[0, 0] + self.covariance[1, 1]) / 2
+        return np.sqrt(of_xy + self.covariance[2, 2] * (arm**2).sum(1) / 2)
+
+
+def estimate_shift(ego: Peaks, sender: Peaks, origin: F64, config: ShiftConfig = DEFAULT_SHIFT) -> SenderShift | None:
+    """Return the correction of a sender at origin (2,) in the ego's frame; None where the peaks do not give one."""
+    away = ego.center[None] - sender.center[:, None]
+    weight = np.sqrt(ego.weight[None] * sender.weight[:, None])
+    near = (away**2).sum(2) <= config.max_shift_m**2
+    if near.any(1).sum() < config.min_pairs:
+        return None
+    best = _find_mode(away, weight, near, config)
+    if best is None:
+        return None
+    rows, columns = _match(away, best, near, config)
+    if len(rows) < config.min_pairs:
+        return None
+    arm = sender.center[rows] - origin
+    design = np.zeros((len(rows), 2, 3))
+    design[:, 0, 0] = design[:, 1, 1] = 1
+    design[:, 0, 2], design[:, 1, 2] = -arm[:, 1], arm[:, 0]
+    measured = away[rows, columns]
+    variance = config.object_sigma_m**2 + sender.sigma[rows] ** 2 + ego.sigma[columns] ** 2
+    solved = _solve(design, measured, weight[rows, columns] / variance, config)
+    if solved is None:
+        return None
+    estimate, covariance = solved
+    return SenderShift(estimate[:2], float(estimate[2]), origin, covariance, len(rows))
+
+
+def _find_mode(away: F64, weight: F64, near: NDArray[np.bool_], config: ShiftConfig) -> F64 | None:
+    """Return the displacement (2,) of most votes; None where another one, apart from it, has almost as many.
+
+    Each peak of the sender votes once for a displacement: by the nearest of its pairs.
+    """
+    candidates = np.concatenate((np.zeros((1, 2)), away[near]))
+    votes = _count_votes(candidates, away, weight, near, config)
+    best = int(votes.argmax())
+    apart = ((candidates - candidates[best]) ** 2).sum(1) > (2 * config.match_m) ** 2
+    if apart.any() and votes[apart].max() > config.max_second * votes[best]:
+        return None
+    # The mean of the pairs that vote for the mode.
+    mode = candidates[best]
+    for _ in range(3):
+        share = np.where(near, weight * np.exp(-((away - mode) ** 2).sum(2) / (2 * config.vote_m**2)), 0.0)
+        mode = (share[:, :, None] * away).sum((0, 1)) / max(share.sum(), 1e-9)
+    return mode
+
+
+def _count_votes(candidates: F64, away: F64, weight: F64, near: NDArray[np.bool_], config: ShiftConfig) -> F64:
+    """Return the votes (k,) for displacements (k, 2); a large displacement is less likely by the prior."""
+    votes = np.zeros(len(candidates))
+    for line, of_pair, is_near in zip(away, weight, near):
+        some, scale = line[is_near], of_pair[is_near]
+        if len(some):
+            square = ((candidates[:, None] - some[None]) ** 2).sum(2)
+            votes += (scale * np.exp(-square / (2 * config.vote_m**2))).max(1)
+    return votes * np.exp(-(candidates**2).sum(1) / (2 * (2 * config.prior_sigma_m) ** 2))
+
+
+def _match(
+    away: F64, mode: F64, near: NDArray[np.bool_], config: ShiftConfig
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return pairs of sender and ego peaks that are the nearest of each other at a displacement."""
+    square = np.where(near, ((away - mode) ** 2).sum(2), np.inf)
+    of_sender, of_ego = square.argmin(1), square.argmin(0)
+    rows = np.arange(len(square))
+    good = (of_ego[of_sender] == rows) & (square[rows, of_sender] <= config.match_m**2)
+    return rows[good], of_sender[good]
+
+
+def _solve(design: F64, measured: F64, precision: F64, config: ShiftConfig) -> tuple[F64, F64] | None:
+    """Return the estimate (3,) and its covariance (3, 3) by least squares with Cauchy weights; None where it is not significant."""
+    prior = np.diag([config.prior_sigma_m**-2.0, config.prior_sigma_m**-2.0, config.prior_sigma_yaw_rad**-2.0])
+    robust, estimate, inverse = np.ones(len(measured)), np.zeros(3), np.linalg.inv(prior)
+    for _ in range(4):
+        scale = precision * robust
+        normal = np.einsum("nij,n,nik->jk", design, scale, design) + prior
+        inverse = np.linalg.inv(normal)
+        estimate = inverse @ np.einsum("nij,n,ni->j", design, scale, measured)
+        error = ((measured - design @ estimate) ** 2).sum(1)
+        robust = 1 / (1 + precision * error / 4)
+    # Against no error at all: the part of the evidence that the estimate explains.
+    chi2 = float(estimate @ (np.linalg.inv(inverse) - prior) @ estimate)
+    return (estimate, inverse) if chi2 >= config.min_chi2 and np.isfinite(estimate).all() else None
+
+
+def find_peaks(xy: F64, heat: F64, sigma: F64, config: ShiftConfig = DEFAULT_SHIFT) -> Peaks:
+    """Return the peaks of proposed centres (n, 2), heat logits (n,), sigmas (n,), metres; the most confident first."""
+    score = 1 / (1 + np.exp(-np.clip(heat, -30, 30)))
+    order = np.argsort(-score, kind="stable")
+    order = order[(score[order] >= config.min_score) & np.isfinite(xy[order]).all(1)][: 8 * config.max_peaks]
+    kept = list[int]()
+    for i in order.tolist():
+        if len(kept) == config.max_peaks:
+            break
+        if not kept or ((xy[kept] - xy[i]) ** 2).sum(1).min() > config.peak_radius_m**2:
+            kept.append(i)
+    return Peaks(xy[kept], score[kept], np.clip(sigma[kept], 0.0, 2.0))
+
+
+def align_senders(tokens: Tokens, config: ShiftConfig = DEFAULT_SHIFT) -> Tokens:
+    """Return the tokens with those of each sender moved by its estimated correction, and the position sigma that is left.
+
+    Tokens of senders without an estimate, and the ego's own current ones, stay as they are. There is no gradient to positions.
+    """
+    with torch.no_grad():
+        return _align(tokens, config)
+
+
+def _align(tokens: Tokens, config: ShiftConfig) -> Tokens:
+    cell_m = tokens.grid.cell_size_m
+    offset = proposed_offset(tokens.proposal)
+    follows = (offset.abs().amax(1) <= MAX_OFFSET_CELLS)[:, None]
+    center = (tokens.xy + torch.where(follows, offset, 0.0) * cell_m).double().cpu().numpy()
+    log_sigma = tokens.proposal[:, BOX_LAYOUT.log_sigma_xy][:, 0].clamp(-5, 3)
+    drift = DRIFT_MPS * 0.1 * tokens.age
+    sigma = (log_sigma.exp() ** 2 + drift**2).sqrt().double().cpu().numpy()
+    heat = proposed_heat(tokens.proposal).double().cpu().numpy()
+    xy, sender_xy = tokens.xy.double().cpu().numpy(), tokens.sender_xy.double().cpu().numpy()
+    context = tokens.pose_context.double().cpu().numpy()
+    group = (tokens.ego * (int(tokens.sender.max()) + 1 if len(tokens.sender) else 1) + tokens.sender).cpu().numpy()
+    egos, senders = tokens.ego.cpu().numpy(), tokens.sender.cpu().numpy()
+    own = {ego: (egos == ego) & (senders == 0) for ego in range(tokens.batch_size)}
+    own_peaks = {ego: find_peaks(center[m], heat[m], sigma[m], config) for ego, m in own.items()}
+    moved, left = xy.copy(), context[:, 3].copy()
+    for number in np.unique(group[senders > 0]):
+        mine = group == number
+        peaks = find_peaks(center[mine], heat[mine], sigma[mine], config)
+        found = estimate_shift(
+            own_peaks[int(egos[mine][0])], peaks, _origin(xy[mine], sender_xy[mine], context[mine]), config
+        )
+        if found is not None:
+            moved[mine] = found.move(xy[mine])
+            left[mine] = found.sigma_m(xy[mine])
+    pose_context = tokens.pose_context.clone()
+    pose_context[:, 3] = torch.from_numpy(left).to(pose_context)
+    changed = torch.from_numpy((moved != xy).any(1)).to(tokens.xy.device)
+    places = torch.where(changed[:, None], torch.from_numpy(moved).to(tokens.xy), tokens.xy)
+    aligned = replace(tokens, xy=places, pose_context=torch.where(changed[:, None], pose_context, tokens.pose_context))
+    inside = (tokens.sender == 0) | tokens.grid.contains(places)
+    return aligned if bool(inside.all()) else aligned.select(inside.nonzero()[:, 0])
+
+
+def _origin(xy: F64, sender_xy: F64, context: F64) -> F64:
+    """Return the place (2,) of a sender in the ego's frame, of its tokens in both frames; motion is averaged out."""
+    sine, cosine = context[:, 1], context[:, 2] + 1
+    x = cosine * sender_xy[:, 0] - sine * sender_xy[:, 1]
+    y = sine * sender_xy[:, 0] + cosine * sender_xy[:, 1]
+    return np.median(xy - np.stack((x, y), 1), axis=0)
+
+
+def _build_aligned_fast(channels: int, attention: AttentionConfig) -> nn.Module:
+    module = get_fusion("fast")(channels, attention)
+    module.register_forward_pre_hook(lambda _, given: (align_senders(given[0]), *given[1:]))
+    return module
+
+
+register_fusion("shift/fast")(_build_aligned_fast)
