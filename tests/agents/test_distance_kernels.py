@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from manyeyes.agents._distance_kernels import count_earlier, has_neighbour
+from manyeyes.agents._distance_kernels import count_earlier, has_neighbour, propagate_centres
 
 
 @pytest.mark.parametrize("num_sent", (0, 30))
@@ -31,3 +31,13 @@ def test_neighbours_lie_within_the_radius_or_on_it() -> None:
     assert found.tolist() == (apart <= 1.5).any(1).tolist() and 0 < found.sum() < 40
     assert found[0] == (np.abs(apart[0]).min() <= 1.5)
     assert not has_neighbour(center, others[:0], 1.5).any()
+
+
+def test_propagated_centres_are_those_of_tensors() -> None:
+    rng = np.random.default_rng(2)
+    tokens, xy = rng.normal(size=(20, 9)).astype(np.float32), rng.uniform(-50, 50, (20, 2)).astype(np.float32)
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    translation = rng.normal(size=3)
+    found = propagate_centres(tokens, xy, (3, 6), (2.0, 0.7), (np.ascontiguousarray(rotation), translation))
+    flat = np.column_stack((xy + 2.0 * tokens[:, 3:5] + 0.7 * tokens[:, 6:8], np.zeros(20)))
+    np.testing.assert_allclose(found, (flat @ rotation.T + translation)[:, :2], atol=1e-4)

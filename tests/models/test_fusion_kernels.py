@@ -15,7 +15,14 @@ from manyeyes.models.detector.transformer import AttentionConfig, WindowBlock
 from manyeyes.models.fusion.flow_aware import FastFusion, PastAttention
 from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
 from manyeyes.models.fusion.token_merge import TokenMerge, assign_cells
-from manyeyes.models.fusion.transform_tokens import MAX_SPEED_MPS, AgentTokens, Tokens, to_ego_frame
+from manyeyes.models.fusion.transform_tokens import (
+    MAX_SPEED_MPS,
+    TOKEN_COLUMNS,
+    AgentTokens,
+    Tokens,
+    split_last,
+    to_ego_frame,
+)
 
 GRID = BevGrid(-25.6, -12.8, -3.0, 25.6, 12.8, 1.0, stride=4)
 CHANNELS = 32
@@ -77,6 +84,18 @@ def test_a_token_names_its_sender_its_type_and_its_place_in_the_senders_frame(tr
     turned = transform([some[0], some[2], some[1], some[3]])
     assert torch.equal(turned.sender[turned.infrastructure].unique(), torch.tensor([2]))
     assert torch.equal(turned.features, tokens.features)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_last_parts_are_those_parts_alone(masked: bool) -> None:
+    first, last = parts()[:3], [replace(p, ego=0) for p in (part(4, 50, 0, 0.1), parts()[3])]
+    last[0] = replace(last[0], ego_from_sender=Transform.from_xyz_yaw(1.0, 0.0, 0.0, 0.1))
+    if masked:
+        first, last = ([replace(p, selection_mask=torch.ones(len(p.tokens))) for p in some] for some in (first, last))
+    got, want = split_last(to_ego_frame([*first, *last], GRID, 1), 3), to_ego_frame(last, GRID, 1)
+    assert len(want.xy) > 50 and want.sender.unique().tolist() == [1, 2]
+    for name in TOKEN_COLUMNS:
+        assert torch.equal(getattr(got, name), getattr(want, name)), name
 
 
 def test_tokens_are_assigned_to_cells_as_by_tensors() -> None:

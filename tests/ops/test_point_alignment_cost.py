@@ -16,6 +16,7 @@ from manyeyes.ops.point_alignment_cost import (
     MIN_POINTS,
     ROAD_CLEARANCE_M,
     compute_alignment_costs,
+    index_points,
 )
 
 STEPS = 9
@@ -74,6 +75,8 @@ def test_costs_are_those_of_every_pair_of_points() -> None:
         want, asked = plain(now, then, boxes[n : n + 1], back[n].double(), float(slack[n]))
         np.testing.assert_allclose(cost[n].numpy(), want, atol=1e-5)
         assert int(count[n]) == asked
+    again = compute_alignment_costs(index_points(now), then, boxes, back, slack, STEPS)
+    assert torch.equal(again[0], cost) and torch.equal(again[1], count)
     assert count.tolist()[2] == 0 and min(count.tolist()[:2]) >= MIN_POINTS
     assert MAX_POINTS in count.tolist()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from manyeyes._jit import Boolx1, F32x1, F32x2, I64x1, njit
+from manyeyes._jit import Boolx1, F32x1, F32x2, F64x1, F64x2, I64x1, njit
 
 
 @njit(cache=True, nogil=True)
@@ -27,6 +27,25 @@ def count_earlier(place: F32x2, heat: F32x1, sent: F32x2, radius_m: float) -> I6
                 count[i] += 1
                 break
     return count
+
+
+@njit(cache=True, nogil=True)
+def propagate_centres(
+    tokens: F32x2, xy: F32x2, columns: tuple[int, int], units: tuple[float, float], motion: tuple[F64x2, F64x1]
+) -> F32x2:  # pragma: no cover
+    """Return (N, 2): the centres that tokens (N, C) at xy (N, 2) propose, propagated by their velocities and moved.
+
+    columns: first ones of offset and velocity. units: metres of one unit of the offset, and of the velocity by now. motion:
+    rotation (3, 3) and translation (3,), applied to points at z = 0.
+    """
+    (offset, velocity), (cell_m, driven_m), (rotation, translation) = columns, units, motion
+    out = np.empty((len(tokens), 2), np.float32)
+    for i in range(len(tokens)):
+        x = xy[i, 0] + tokens[i, offset] * np.float32(cell_m) + tokens[i, velocity] * np.float32(driven_m)
+        y = xy[i, 1] + tokens[i, offset + 1] * np.float32(cell_m) + tokens[i, velocity + 1] * np.float32(driven_m)
+        for axis in range(2):
+            out[i, axis] = rotation[axis, 0] * x + rotation[axis, 1] * y + translation[axis]
+    return out
 
 
 @njit(cache=True, nogil=True)

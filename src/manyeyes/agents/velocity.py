@@ -28,7 +28,7 @@ from manyeyes.agents._velocity_kernels import (
     significant_velocities,
 )
 from manyeyes.datatypes import Boxes, PointCloud, Transform
-from manyeyes.ops.point_alignment_cost import MAX_POINTS, compute_alignment_costs
+from manyeyes.ops.point_alignment_cost import MAX_POINTS, compute_alignment_costs, index_points
 
 LONGITUDINAL_SIGMAS = np.linspace(-3.0, 3.0, 31)
 """Longitudinal search offsets, in standard deviations of the line fit."""
@@ -128,10 +128,11 @@ def _match_points(
     cost = np.tile(LONGITUDINAL_SIGMAS**2, (len(boxes), 1))
     found, velocity = boxes[torch.from_numpy(rows)], torch.from_numpy(fit.velocity[rows])
     reach = torch.from_numpy(LONGITUDINAL_SIGMAS[-1] * sigma[rows])
+    indexed = index_points(points)
     for then, earlier in sweeps:
         moved = earlier if then.now_from_then is None else earlier.transform(then.now_from_then)
         missed, num_compared = compute_alignment_costs(
-            points, moved.xyz, found, velocity * then.age_s, reach * then.age_s, len(LONGITUDINAL_SIGMAS)
+            indexed, moved.xyz, found, velocity * then.age_s, reach * then.age_s, len(LONGITUDINAL_SIGMAS)
         )
         cost[rows] += (config.point_match_weight * (num_compared / MAX_POINTS)[:, None] * missed).numpy()
     choose_candidates(fit, yaw, sigma, LONGITUDINAL_SIGMAS, cost)

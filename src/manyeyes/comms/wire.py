@@ -330,30 +330,42 @@ def _encode_covariance(covariance: NDArray[np.float64]) -> list[int]:
     """Codes of the standard deviations and of the factor of the correlations of a (3, 3), where zero rows are allowed."""
     if covariance.shape != (3, 3) or not np.isfinite(covariance).all():
         raise WireError(f"Message.pose_covariance is a finite (3, 3); got {covariance.tolist()}.")
-    sigma = np.sqrt(np.maximum(covariance.diagonal(), 0))
-    # Metres and radians differ by orders of magnitude: what counts as zero is evaluated on the correlations.
-    scale = np.outer(sigma, sigma)
-    correlation = np.divide(covariance, scale, out=np.zeros((3, 3)), where=scale > 0)
-    back = correlation * scale
-    good = bool((np.abs(covariance - back) <= 1e-6 * np.abs(back)).all())
-    good &= bool((np.abs(correlation - correlation.T) <= 1e-6).all())
-    lower = np.zeros((3, 3))
-    for j in range(3):
-        pivot = correlation[j, j] - lower[j, :j] @ lower[j, :j]
-        column = correlation[j + 1 :, j] - lower[j + 1 :, :j] @ lower[j, :j]
-        if pivot > 1e-9:
-            lower[j, j] = np.sqrt(pivot)
-            lower[j + 1 :, j] = column / lower[j, j]
-        else:
-            good &= pivot > -1e-6 and bool((np.abs(column) < 1e-3).all())
-    if not good:
-        raise WireError(f"Message.pose_covariance is symmetric and positive semidefinite; got {covariance.tolist()}.")
-    if (sigma[:2] > _SIGMA_M[1]).any():
-        raise WireError(f"Message.pose_covariance is too large to send (over 10 km): {covariance.tolist()}.")
+    rows = covariance.tolist()
+    sigma = [math.sqrt(max(rows[k][k], 0.0)) for k in range(3)]
+    lower = _correlation_factor(rows, sigma)
+    if lower is None:
+        raise WireError(f"Message.pose_covariance is symmetric and positive semidefinite; got {rows}.")
+    if max(sigma[:2]) > _SIGMA_M[1]:
+        raise WireError(f"Message.pose_covariance is too large to send (over 10 km): {rows}.")
+    codes = [*log_codes(np.array(sigma[:2]), *_SIGMA_M), *log_codes(np.array(sigma[2:]), *_SIGMA_RAD)]
     # Rows have length 1, except for rounding and for zero variances.
-    lower /= np.maximum(np.linalg.norm(lower, axis=1, keepdims=True), 1e-9)
-    codes = [*log_codes(sigma[:2], *_SIGMA_M), *log_codes(sigma[2:], *_SIGMA_RAD)]
-    return [int(v) for v in (*codes, *np.rint(lower[[1, 2, 2], [0, 0, 1]] * 127))]
+    lengths = [max(math.sqrt(sum(v * v for v in row)), 1e-9) for row in lower]
+    return [*map(int, codes), *(round(lower[i][j] / lengths[i] * 127) for i, j in ((1, 0), (2, 0), (2, 1)))]
+
+
+def _correlation_factor(covariance: list[list[float]], sigma: list[float]) -> list[list[float]] | None:
+    """Return the lower factor of the correlations of a (3, 3), where zero rows are allowed; None where there is none."""
+    # Metres and radians differ by orders of magnitude: what counts as zero is evaluated on the correlations.
+    correlation, lower = ([[0.0] * 3 for _ in range(3)] for _ in range(2))
+    for i in range(3):
+        for j in range(3):
+            scale = sigma[i] * sigma[j]
+            correlation[i][j] = covariance[i][j] / scale if scale > 0 else 0.0
+            back = correlation[i][j] * scale
+            if abs(covariance[i][j] - back) > 1e-6 * abs(back):
+                return None
+    if any(abs(correlation[i][j] - correlation[j][i]) > 1e-6 for i, j in ((0, 1), (0, 2), (1, 2))):
+        return None
+    for j in range(3):
+        pivot = correlation[j][j] - sum(v * v for v in lower[j][:j])
+        column = [correlation[i][j] - sum(u * v for u, v in zip(lower[i][:j], lower[j])) for i in range(j + 1, 3)]
+        if pivot > 1e-9:
+            lower[j][j] = math.sqrt(pivot)
+            for i, value in enumerate(column, j + 1):
+                lower[i][j] = value / lower[j][j]
+        elif pivot <= -1e-6 or any(abs(v) >= 1e-3 for v in column):
+            return None
+    return lower
 
 
 def _decode_covariance(covariance_codes: tuple[int, ...]) -> NDArray[np.float64]:

@@ -111,7 +111,9 @@ class Boxes:
 
     def to(self, dtype: torch.dtype | None = None, device: torch.device | None = None) -> Boxes:
         """Return the same boxes in another floating-point type, or on another device, or both."""
-        values = (getattr(self, f.name) for f in fields(self))
+        values = [getattr(self, f.name) for f in fields(self)]
+        if device is None and all(dtype is None or v.dtype == dtype or not v.is_floating_point() for v in values):
+            return self
         return Boxes(*(v.to(device=device, dtype=dtype if v.is_floating_point() else None) for v in values))
 
     def transform(self, target_from_source: Transform) -> Boxes:

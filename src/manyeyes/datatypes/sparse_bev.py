@@ -62,9 +62,12 @@ class Sites:
     def xy(self) -> Tensor:
         """(N, 2) float32: metric centres in the agent's frame."""
         if self.key.device.type == "cpu":
-            grid = self.grid
-            lattice = CellLattice(*grid.shape, grid.stride, float(grid.pillar), float(grid.x_min), float(grid.y_min))
-            return torch.from_numpy(compute_centers(self.key.numpy(), lattice))
+            if "xy" not in self.cache:
+                grid = self.grid
+                corner = float(grid.x_min), float(grid.y_min)
+                lattice = CellLattice(*grid.shape, grid.stride, float(grid.pillar), *corner)
+                self.cache["xy"] = compute_centers(self.key.numpy(), lattice)
+            return torch.from_numpy(self.cache["xy"])
         return self._keep_on_device("xy", lambda: self.grid.centers(self.yx))
 
     def _keep_on_device(self, name: str, compute: Callable[[], Tensor]) -> Tensor:

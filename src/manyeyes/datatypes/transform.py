@@ -90,10 +90,14 @@ class Transform:
     def inverse(self) -> Transform:
         """Return the inverse motion, source_from_target."""
         back = self.rotation.mT
+        if back.dim() == 2:
+            return Transform(back, back.mv(self.translation).neg())
         return Transform(back, -(back @ self.translation[..., None])[..., 0])
 
     def __matmul__(self, other: Transform) -> Transform:
         """a_from_b @ b_from_c = a_from_c, batches broadcast."""
+        if self.rotation.dim() == other.rotation.dim() == 2:
+            return Transform(self.rotation.mm(other.rotation), self.rotation.mv(other.translation) + self.translation)
         moved = (self.rotation @ other.translation[..., None])[..., 0] + self.translation
         rotation = self.rotation @ other.rotation
         return Transform(rotation.expand(*moved.shape[:-1], 3, 3), moved)

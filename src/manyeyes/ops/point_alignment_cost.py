@@ -33,22 +33,36 @@ _CELLS = 128
 """Number of cells on each axis of the index of points, which is centred at the origin; border cells hold all points beyond."""
 
 
+class PointCells(NamedTuple):
+    """Points (P, 3) by cells of the ground: rows start[c] to start[c + 1] of order are those of cell c, ascending."""
+
+    points: F32x2
+    start: I32x1
+    order: I32x1
+
+
 def compute_alignment_costs(
-    now: Tensor, then: Tensor, boxes: Boxes, back: Tensor, slack: Tensor, steps: int
+    now: Tensor | PointCells, then: Tensor, boxes: Boxes, back: Tensor, slack: Tensor, steps: int
 ) -> tuple[Tensor, Tensor]:
     """Return (N, steps), how badly points now and then meet, from 0 to 1, and (N,), the number of points that were asked.
 
-    now: (P, 3), then: (Q, 3), float32 metres, in the frame of boxes (N). Candidate k has it that an object was ``back`` (N, 2) and
-    d_k along its length behind where it is, d evenly from -slack to slack (N,). The cost is the mean over its points now of
-    min(1, (distance / MAX_DISTANCE_M)^2) to the nearest one then, moved by that much. 0, of no points, where either sweep
-    has too few.
+    now: (P, 3), or its index (``index_points``), then: (Q, 3), float32 metres, in the frame of boxes (N). Candidate k has it that
+    an object was ``back`` (N, 2) and d_k along its length behind where it is, d evenly from -slack to slack (N,). The cost is the
+    mean over its points now of min(1, (distance / MAX_DISTANCE_M)^2) to the nearest one then, moved by that much. 0, of no
+    points, where either sweep has too few.
     """
     cost, count = np.zeros((len(boxes), steps)), np.zeros(len(boxes), np.int64)
     place = torch.cat((boxes.center, boxes.yaw.cos()[:, None], boxes.yaw.sin()[:, None], boxes.size / 2), 1)
-    here, before = (cloud.to(torch.float32).contiguous().numpy() for cloud in (now, then))
+    here = now if isinstance(now, PointCells) else index_points(now)
+    before = then.to(torch.float32).contiguous().numpy()
     middles, moved, away = (rows.double().contiguous().numpy() for rows in (place, back, slack))
     _match(here, before, middles, moved, away, cost, count)
     return torch.from_numpy(cost).to(back.dtype), torch.from_numpy(count)
+
+
+def index_points(points: Tensor) -> PointCells:
+    """Index points (P, 3) of a sweep that is compared with several."""
+    return _index_points(points.to(torch.float32).contiguous().numpy())
 
 
 class _Region(NamedTuple):
@@ -74,14 +88,6 @@ class _Found(NamedTuple):
     xyz: F32x2
 
 
-class _PointCells(NamedTuple):
-    """Points (P, 3) by cells of the ground: rows start[c] to start[c + 1] of order are those of cell c, ascending."""
-
-    points: F32x2
-    start: I32x1
-    order: I32x1
-
-
 @njit(cache=True, nogil=True)
 def _cell_at(metres: float) -> int:  # pragma: no cover
     """Return the row or column of a coordinate; NaN is in the first."""
@@ -90,7 +96,7 @@ def _cell_at(metres: float) -> int:  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _index_points(points: F32x2) -> _PointCells:  # pragma: no cover
+def _index_points(points: F32x2) -> PointCells:  # pragma: no cover
     """Sort points (P, 3) by cells (counting sort)."""
     cell, start = np.empty(len(points), np.int32), np.zeros(_CELLS * _CELLS + 1, np.int32)
     for p in range(len(points)):
@@ -102,11 +108,11 @@ def _index_points(points: F32x2) -> _PointCells:  # pragma: no cover
     for p in range(len(points)):
         order[filled[cell[p]]] = p
         filled[cell[p]] += 1
-    return _PointCells(points, start, order)
+    return PointCells(points, start, order)
 
 
 @njit(cache=True, nogil=True)
-def _find_inside(cells: _PointCells, region: _Region, out: _Found) -> int:  # pragma: no cover
+def _find_inside(cells: PointCells, region: _Region, out: _Found) -> int:  # pragma: no cover
     """Write the points in a region to out, by cells; how many."""
     points, start, order = cells
     x0, y0, z0, c, s, length, width, bottom, top = region
@@ -126,15 +132,15 @@ def _find_inside(cells: _PointCells, region: _Region, out: _Found) -> int:  # pr
 
 @njit(cache=True, nogil=True)
 def _match(
-    now: F32x2, then: F32x2, places: F64x2, back: F64x2, slack: F64x1, cost: F64x2, count: I64x1
+    cells_now: PointCells, then: F32x2, places: F64x2, back: F64x2, slack: F64x1, cost: F64x2, count: I64x1
 ) -> None:  # pragma: no cover
     """Fills cost (N, S) and count (N,); places (N, 8): centre, cosine and sine of the yaw, half sizes."""
     steps, limit = cost.shape[1], np.float32(MAX_DISTANCE_M * MAX_DISTANCE_M)
     # Whole vectors of candidates; those beyond the last are not read.
     offset = np.empty((steps + _LANES - 1) // _LANES * _LANES, np.float32)
     best = np.empty_like(offset)
-    cells_now, cells_then = _index_points(now), _index_points(then)
-    mine = _Found(np.empty(len(now), np.int32), np.empty((3, len(now)), np.float32))
+    cells_then, num_now = _index_points(then), len(cells_now.points)
+    mine = _Found(np.empty(num_now, np.int32), np.empty((3, num_now), np.float32))
     theirs = _Found(np.empty(len(then), np.int32), np.empty((3, len(then)), np.float32))
     for n in range(len(places)):
         x, y, z, c, s, length, width, height = places[n]

@@ -267,3 +267,25 @@ def test_two_real_scans_of_one_place_have_one_ground() -> None:
     there, moved = fits[2].plane, fits[1].plane
     assert there is not None and moved is not None
     assert math.hypot(there.slope_x - moved.slope_x, there.slope_y - moved.slope_y) < math.radians(0.5)
+
+
+def test_weighted_moments_are_those_of_matrices() -> None:
+    rng = np.random.default_rng(7)
+    places, weight = rng.normal(0, 20, (60, 3)), rng.random(60)
+    plane = np.array([0.02, -0.01, 0.3])
+    once, twice, mean_square = kernels.weighted_moments(places, weight, plane)
+    terms = np.column_stack((places[:, :2], np.ones(60)))
+    np.testing.assert_allclose(once, terms.T @ np.diag(weight) @ terms, rtol=1e-9)
+    np.testing.assert_allclose(twice, terms.T @ np.diag(weight) ** 2 @ terms, rtol=1e-9)
+    assert mean_square == pytest.approx(np.average((places[:, 2] - terms @ plane) ** 2, weights=weight))
+    ranges, falling = kernels.ring_weights(places, 5.0)
+    np.testing.assert_allclose(ranges, np.hypot(places[:, 0], places[:, 1]))
+    np.testing.assert_allclose(falling, np.where(ranges > 5.0, 5.0 / ranges, 1.0))
+
+
+def test_the_height_sigma_is_that_of_the_worst_direction() -> None:
+    root = np.random.default_rng(8).normal(size=(3, 3)) * (1e-3, 2e-3, 0.02)
+    covariance = root.T @ root
+    plane = GroundPlane(0.0, 0.0, 0.0, covariance)
+    slope_sigma = math.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+    assert plane.height_sigma_m(30.0) == pytest.approx(math.sqrt(covariance[2, 2]) + 30.0 * slope_sigma)

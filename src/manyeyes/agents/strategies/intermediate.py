@@ -23,7 +23,7 @@ from manyeyes.agents.token_codec import has_token_history
 from manyeyes.comms.request_map import compute_request_weights
 from manyeyes.datatypes import AgentFrame, Boxes, Message, SparseBev, Transform
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat
-from manyeyes.models.fusion.transform_tokens import AgentTokens, Tokens, to_ego_frame
+from manyeyes.models.fusion.transform_tokens import AgentTokens, Tokens, split_last, to_ego_frame
 from manyeyes.ops.keyed_random import keyed_uniform
 
 
@@ -128,7 +128,9 @@ def gather_with_past(
     """Return the ego's current and past tokens with those of every message on the same lattice; and its own past tokens alone."""
     grid = cache.process_tokens(frame).shared_tokens.grid
     past = cache.previous_tokens(frame) if has_token_history(cache.detector) else []
-    return gather_tokens(cache, frame, messages, past), to_ego_frame(past, grid, 1) if past else None
+    num_received = sum(m.tokens is not None and m.tokens.grid == grid for m in messages)
+    tokens = gather_tokens(cache, frame, messages, past)
+    return tokens, split_last(tokens, 1 + num_received) if past else None
 
 
 def _to_agent_tokens(frame: AgentFrame, ego_from_world: Transform, message: Message, tokens: SparseBev) -> AgentTokens:

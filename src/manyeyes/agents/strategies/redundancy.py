@@ -12,10 +12,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from manyeyes.agents._distance_kernels import count_earlier
+from manyeyes.agents._distance_kernels import count_earlier, propagate_centres
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.datatypes import AgentFrame, SparseBev
-from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat, proposed_offset, proposed_velocity
+from manyeyes.models.detector.box_head import BOX_LAYOUT, SPEED_UNIT
+from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat, proposed_offset
 
 REDUNDANCY_DECAY = 0.7
 """Factor on the score for each earlier token of the same object; chosen on Town07 (0.5 to 0.85 are similar)."""
@@ -51,7 +52,13 @@ def proposed_centres(tokens: SparseBev) -> Tensor:
 
 def _propagate_centres(frame: AgentFrame, then: AgentFrame, sent: SparseBev) -> Tensor:
     """Return (N, 2): proposed centres of an earlier frame's tokens, propagated to this frame."""
-    seconds = (frame.timestamp_ns - then.timestamp_ns) / 1e9
-    xy = proposed_centres(sent) + proposed_velocity(sent.features[:, -PROPOSAL_DIM:]) * seconds
-    moved = frame.now_from_earlier(then).apply(torch.cat((xy, xy.new_zeros(len(xy), 1)), 1).double())
-    return moved[:, :2].to(xy.dtype)
+    seconds, motion = (frame.timestamp_ns - then.timestamp_ns) / 1e9, frame.now_from_earlier(then).double()
+    first = sent.features.shape[1] - PROPOSAL_DIM
+    centres = propagate_centres(
+        sent.features.float().contiguous().numpy(),
+        sent.sites.xy.numpy(),
+        (first + BOX_LAYOUT.offset.start, first + BOX_LAYOUT.velocity.start),
+        (float(sent.grid.cell_size_m), SPEED_UNIT * seconds),
+        (motion.rotation.contiguous().numpy(), motion.translation.contiguous().numpy()),
+    )
+    return torch.from_numpy(centres).to(sent.features.dtype)

@@ -134,10 +134,10 @@ def to_ego_frame(agent_tokens: Iterable[AgentTokens], grid: BevGrid, batch_size:
     tokens.
     """
     parts = list(agent_tokens)
-    if all(part.selection_mask is None and is_plain(part.tokens, part.xy) for part in parts):
-        return _transform_in_loops(parts, grid, batch_size)
-    sizes, device = [part.tokens.shape[0] for part in parts], parts[0].tokens.device
     tokens, sender_xy = torch.cat([part.tokens for part in parts]), torch.cat([part.xy for part in parts])
+    if all(part.selection_mask is None for part in parts) and is_plain(tokens, sender_xy):
+        return _transform_in_loops(parts, tokens, sender_xy, grid, batch_size)
+    sizes, device = [part.tokens.shape[0] for part in parts], parts[0].tokens.device
     masks = [
         part.tokens.new_ones(size) if part.selection_mask is None else part.selection_mask
         for part, size in zip(parts, sizes)
@@ -188,24 +188,36 @@ def grid_cells(grid: BevGrid) -> GridCells:
     return GridCells(x_min, y_min, x_max, y_max, float(grid.pillar), grid.stride, *grid.shape)
 
 
-def _transform_in_loops(parts: Sequence[AgentTokens], grid: BevGrid, batch_size: int) -> Tokens:
-    """Transform as by tensors, without masks."""
-    tokens, xy = torch.cat([part.tokens for part in parts]), torch.cat([part.xy for part in parts])
+def split_last(tokens: Tokens, num_parts: int) -> Tokens:
+    """Return the tokens of the parts after the first num_parts, of which the first is the ego's own; one ego.
+
+    As ``to_ego_frame`` of those parts alone.
+    """
+    first = int((tokens.sender < num_parts).sum())
+    columns = {name: getattr(tokens, name)[first:] for name in TOKEN_COLUMNS}
+    return Tokens(**columns | {"sender": columns["sender"] - (num_parts - 1)}, grid=tokens.grid, batch_size=1)
+
+
+def _transform_in_loops(
+    parts: Sequence[AgentTokens], tokens: Tensor, xy: Tensor, grid: BevGrid, batch_size: int
+) -> Tokens:
+    """Transform tokens and places of all parts as by tensors, without masks."""
     widths = (tokens.shape[1] - PROPOSAL_DIM, 2, POSE_CONTEXT_DIM, PROPOSAL_DIM)
     columns = [xy.new_empty(len(xy), width) for width in widths]
     row = xy.new_empty(len(xy), dtype=torch.int64)
     features, places, context, proposal = (column.numpy() for column in columns)
     out = MovedTokens(features, places, context, proposal, row.numpy())
-    sizes, links = np.array([len(part.xy) for part in parts]), _describe_links(parts)
+    sizes, links = np.array([len(part.xy) for part in parts]), _describe_links(parts).numpy()
     count = move_tokens(
-        tokens.numpy(), xy.numpy(), sizes, links.numpy(), MAX_SPEED_MPS, PROPOSAL_COLUMNS, grid_cells(grid), out
+        tokens.numpy(), xy.numpy(), sizes, links, MAX_SPEED_MPS, PROPOSAL_COLUMNS, grid_cells(grid), out
     )
     features, places, context, proposal = (column[:count] for column in columns)
-    row = row[:count]
-    ego, sender, infrastructure = links[:, [1, 20, 21]].long()[_part_numbers(parts)[row]].unbind(1)
-    mask, sender_xy = xy.new_ones(count), xy[row]
-    origin = (sender.contiguous(), infrastructure > 0, sender_xy)
-    return Tokens(features, places, ego.contiguous(), context, proposal, mask, *origin, grid, batch_size)
+    part = np.arange(len(parts)).repeat(sizes)[out.row[:count]]
+    ego, sender, infrastructure = (torch.from_numpy(links[:, k].astype(np.int64)[part]) for k in (1, 20, 21))
+    mask, sender_xy = xy.new_ones(count), xy[row[:count]]
+    return Tokens(
+        features, places, ego, context, proposal, mask, sender, infrastructure > 0, sender_xy, grid, batch_size
+    )
 
 
 def _part_numbers(parts: Sequence[AgentTokens]) -> Tensor:
@@ -230,18 +242,15 @@ def _describe_links(parts: Sequence[AgentTokens]) -> Tensor:
     Whether the tokens are the ego's current ones, the number of the ego, age, both sigmas, sine, cosine and cosine - 1 of the
     yaw, rotation (9), translation (3), the number of the sender, and whether it is a roadside unit.
     """
-    own = Transform.identity()
-    motions = [own if part.ego_from_sender is None else part.ego_from_sender.double() for part in parts]
-    motion = Transform(torch.stack([m.rotation for m in motions]), torch.stack([m.translation for m in motions]))
-    numbers = [
-        (part.ego_from_sender is None, part.ego, part.age_s, part.sigma_xy_m, part.sigma_yaw_rad) for part in parts
-    ]
-    given = torch.tensor(numbers, dtype=torch.float64, device="cpu")
-    origin = torch.tensor(
-        [(number, part.is_infrastructure) for number, part in zip(_number_senders(parts), parts)],
-        dtype=torch.float64,
-        device="cpu",
-    )
-    yaw = motion.yaw[:, None]
-    turn = yaw.sin(), yaw.cos(), yaw.cos() - 1
-    return torch.cat((given, *turn, motion.rotation.flatten(1), motion.translation, origin), 1)
+    links = np.zeros((len(parts), 22))
+    links[:, [8, 12, 16]] = 1.0
+    for link, part, number in zip(links, parts, _number_senders(parts)):
+        motion = part.ego_from_sender
+        link[:5] = motion is None, part.ego, part.age_s, part.sigma_xy_m, part.sigma_yaw_rad
+        link[20:] = number, part.is_infrastructure
+        if motion is not None:
+            link[8:17], link[17:20] = motion.rotation.flatten().cpu().numpy(), motion.translation.cpu().numpy()
+    yaw = np.arctan2(links[:, 11], links[:, 8])
+    links[:, 5], links[:, 6] = np.sin(yaw), np.cos(yaw)
+    links[:, 7] = links[:, 6] - 1
+    return torch.from_numpy(links)

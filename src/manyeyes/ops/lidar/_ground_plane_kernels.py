@@ -138,6 +138,32 @@ def refine(
 
 
 @njit(cache=True, nogil=True)
+def ring_weights(places: F64x2, ring_m: float) -> tuple[F64x1, F64x1]:  # pragma: no cover
+    """Return ranges (K,) of places (K, 3), and weights with which every ring beyond ring_m counts the same."""
+    ranges, weight = np.empty(len(places)), np.empty(len(places))
+    for n in range(len(places)):
+        ranges[n] = math.hypot(places[n, 0], places[n, 1])
+        weight[n] = ring_m / max(ranges[n], ring_m)
+    return ranges, weight
+
+
+@njit(cache=True, nogil=True)
+def weighted_moments(places: F64x2, weight: F64x1, plane: F64x1) -> tuple[F64x2, F64x2, float]:  # pragma: no cover
+    """Return T' W T and T' W^2 T (3, 3), of the rows x, y, 1 of places (K, 3), and the weighted mean of squared residuals."""
+    once, twice = np.zeros((3, 3)), np.zeros((3, 3))
+    squares, total, row = 0.0, 0.0, np.ones(3)
+    for n in range(len(places)):
+        row[0], row[1], w = places[n, 0], places[n, 1], weight[n]
+        for i in range(3):
+            for j in range(3):
+                once[i, j] += w * row[i] * row[j]
+                twice[i, j] += w * w * row[i] * row[j]
+        residual = places[n, 2] - plane[0] * row[0] - plane[1] * row[1] - plane[2]
+        squares, total = squares + w * residual * residual, total + w
+    return once, twice, squares / total
+
+
+@njit(cache=True, nogil=True)
 def mean_of_cells(
     xyz: F32x2, cell_of_point: I32x1, num_cells: int, plane: F64x1, tolerance: Tolerance
 ) -> F64x2:  # pragma: no cover

@@ -30,6 +30,8 @@ from manyeyes.ops.lidar._ground_plane_kernels import (
     lowest_of_cells,
     mean_of_cells,
     refine,
+    ring_weights,
+    weighted_moments,
 )
 
 Floats = NDArray[np.float64]
@@ -75,8 +77,10 @@ class GroundPlane:
 
     def height_sigma_m(self, range_m: float) -> float:
         """Return the standard deviation of the height at a range, at most, in the worst direction."""
-        slope_variance = float(np.linalg.eigvalsh(self.covariance[:2, :2])[-1])
-        return math.sqrt(max(0.0, float(self.covariance[2, 2]))) + range_m * math.sqrt(max(0.0, slope_variance))
+        (xx, xy, _), (_, yy, _), (_, _, height_variance) = self.covariance.tolist()
+        # The larger eigenvalue of the slopes' covariance.
+        slope_variance = (xx + yy) / 2 + math.hypot((xx - yy) / 2, xy)
+        return math.sqrt(max(0.0, height_variance)) + range_m * math.sqrt(max(0.0, slope_variance))
 
     def levelled_from_points(self) -> Transform:
         """Return the motion that puts the plane at z = 0: the smallest rotation, which turns no heading, then a shift along z."""
@@ -157,14 +161,14 @@ def fit_ground_plane(points: Tensor, config: GroundPlaneConfig = DEFAULT_GROUND_
     if len(lowest) < config.min_cells:
         return GroundFit(GroundStatus.FEW_POINTS)
     num_cells = count_cells(config.cell_m, config.max_range_m) ** 2
-    ranges, weight = _ring_weights(lowest)
+    ranges, weight = ring_weights(lowest, _RING_M)
     plane = find_consensus(lowest, weight, ranges, _CONSENSUS, _draws(), max_slope, _BELOW_FACTOR)
     plane, support = refine(lowest, weight, ranges, _CANDIDATES, plane, 5)
     fraction = float((weight * (support > 0)).sum() / weight.sum())
     means = mean_of_cells(xyz, cell_of_point, num_cells, plane, _BAND)
     if len(means) < config.min_cells or fraction < config.min_cell_fraction:
         return GroundFit(GroundStatus.FEW_POINTS)
-    ranges, weight = _ring_weights(means)
+    ranges, weight = ring_weights(means, _RING_M)
     plane, weight = refine(means, weight, ranges, _MEANS, plane, 3)
     if int((weight > 0).sum()) < config.min_cells:
         return GroundFit(GroundStatus.FEW_POINTS)
@@ -186,19 +190,11 @@ def _classify(plane: GroundPlane, lowest: Floats, config: GroundPlaneConfig) -> 
     return GroundStatus.FOUND if near >= _near_support(lowest, np.zeros(3), config) else GroundStatus.UNEVEN
 
 
-def _ring_weights(places: Floats) -> tuple[Floats, Floats]:
-    """Return ranges (K,) of places (K, 3), and weights with which every ring counts the same."""
-    ranges = np.hypot(places[:, 0], places[:, 1])
-    return ranges, _RING_M / np.maximum(ranges, _RING_M)
-
-
 def _covariance(places: Floats, weight: Floats, plane: Floats) -> Floats:
     """Return the covariance (3, 3) of a weighted fit whose residuals have one variance and are correlated over neighbours."""
-    terms = np.column_stack((places[:, :2], np.ones(len(places))))
-    residual = places[:, 2] - terms @ plane
-    variance = max(_MIN_RESIDUAL_M**2, float(weight @ residual**2 / weight.sum()))
-    inverse = np.linalg.inv(terms.T @ (weight[:, None] * terms))
-    return _CORRELATED_CELLS * variance * inverse @ (terms.T @ (weight[:, None] ** 2 * terms)) @ inverse
+    once, twice, mean_square = weighted_moments(places, weight, plane)
+    inverse = np.linalg.inv(once)
+    return _CORRELATED_CELLS * max(_MIN_RESIDUAL_M**2, mean_square) * inverse @ twice @ inverse
 
 
 def _near_support(lowest: Floats, plane: Floats, config: GroundPlaneConfig) -> float:
