@@ -5,62 +5,110 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
+import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
 from manyeyes.agents.perception_cache import PerceptionCache
-from manyeyes.agents.pose_correction import extract_message_boxes
 from manyeyes.agents.strategies.message_header import age_s, ego_from_sender
+from manyeyes.agents.trust.association import Floats
 from manyeyes.datatypes import AgentFrame, Boxes, Message
+from manyeyes.models.detector.box_head import RawBoxes, decode
+from manyeyes.models.detector.proposal import PROPOSAL_DIM
+from manyeyes.models.detector.protocols import has_tokens
 
 SIGMA_VELOCITY_MPS = 1.0
 """Standard deviation of an object's velocity."""
+MIN_SCORE = 0.3
+"""Minimum score of a claim: boxes below are mostly errors of an honest detector."""
 MAX_CLAIMS = 256
 """Number of claims of a message that are assessed, by falling score: all that ``comms`` admits as objects."""
 
 
 @dataclass(frozen=True)
 class Claims:
-    """Objects that one sender claims.
+    """N objects that one sender claims, by falling score, in the ego's frame at its time; arrays are float64.
 
-    boxes: (N,) by falling score, in the ego's frame at its time. sigma_m: (N,) metres, of their centres: of both poses, of the
-    object, and of its motion since the message. sender_xy: (2,) metres, of the sender in the ego's frame. is_complete: the message
-    states all objects that its sender detects, so that a missing one means something; tokens within a budget do not.
+    columns: (N, 7) centre, size (metres) and yaw; velocity: (N, 2) m/s; score: (N,). sigma_m: (N,) metres, of the centres: of both
+    poses, of the object, and of its motion since the message. sender_xy: of the sender. is_complete: the message states all
+    objects that its sender detects, so that a missing one means something; tokens within a budget do not.
     """
 
     agent_id: int
-    boxes: Boxes
-    sigma_m: Tensor
-    sender_xy: tuple[float, float]
+    columns: Floats
+    velocity: Floats
+    score: Floats
+    sigma_m: Floats
+    sender_xy: tuple[float, float] = (0.0, 0.0)
     age_s: float = 0.0
     is_complete: bool = False
 
+    @classmethod
+    def of(cls, agent_id: int, boxes: Boxes, sigma_m: Floats) -> Claims:
+        """Return claims of boxes in the ego's frame."""
+        columns = torch.cat((boxes.center, boxes.size, boxes.yaw[:, None]), 1).double().numpy()
+        return cls(agent_id, columns, boxes.velocity.double().numpy(), boxes.score.double().numpy(), sigma_m)
+
     def __len__(self) -> int:
-        return len(self.boxes)
+        return len(self.columns)
+
+    def __getitem__(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Claims:
+        names = ("columns", "velocity", "score", "sigma_m")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+
+    @property
+    def xy(self) -> Floats:
+        """Centres (N, 2)."""
+        return self.columns[:, :2]
+
+    @property
+    def boxes(self) -> Boxes:
+        """The claims as boxes, float64."""
+        center, size, yaw = np.split(self.columns, (3, 6), axis=1)
+        return Boxes.of(center, size, yaw[:, 0], self.score, velocity=self.velocity)
 
 
 def extract_claims(frame: AgentFrame, cache: PerceptionCache, messages: Sequence[Message]) -> tuple[Claims, ...]:
-    """Return the claims of each message. Clouds claim nothing: a detector would have to run on each."""
+    """Return the claims of each message of MIN_SCORE. Clouds claim nothing: a detector would have to run on each."""
     return tuple(_extract(frame, cache, message) for message in messages)
 
 
 def _extract(frame: AgentFrame, cache: PerceptionCache, message: Message) -> Claims:
     ego_from_other, seconds = ego_from_sender(frame, message), age_s(frame, message)
-    has_claims = message.objects is not None or message.tokens is not None
-    stated = extract_message_boxes(cache, message) if has_claims else Boxes.empty()
-    there = stated[stated.score.argsort(descending=True, stable=True)[:MAX_CLAIMS]].to(torch.float64)
-    boxes = there.after(seconds).transform(ego_from_other)
-    x, y, yaw = (frame.pose_covariance + message.pose_covariance).double().diagonal().clamp_min(0).tolist()
-    lever = there.center[:, :2].square().sum(1)
-    variance = (x + y) / 2 + yaw * lever + there.sigma_xy.square() + (SIGMA_VELOCITY_MPS * seconds) ** 2
-    origin = ego_from_other.translation.tolist()
-    return Claims(
+    rotation, origin = ego_from_other.rotation.numpy(), ego_from_other.translation.numpy()
+    boxes = _stated_boxes(cache, message)
+    array = {f.name: getattr(boxes, f.name).numpy().astype(np.float64) for f in fields(boxes)}
+    rows = np.argsort(-array["score"], kind="stable")[:MAX_CLAIMS]
+    rows = rows[array["score"][rows] >= MIN_SCORE]
+    center, velocity = array["center"][rows], array["velocity"][rows]
+    x, y, yaw = np.diagonal((frame.pose_covariance + message.pose_covariance).double().numpy()).clip(0).tolist()
+    variance = (x + y) / 2 + yaw * (center[:, :2] ** 2).sum(1)
+    variance += array["sigma_xy"][rows] ** 2 + (SIGMA_VELOCITY_MPS * seconds) ** 2
+    center[:, :2] += velocity * seconds
+    turn = math.atan2(rotation[1, 0], rotation[0, 0])
+    columns = (center @ rotation.T + origin, array["size"][rows], (array["yaw"][rows] + turn)[:, None])
+    claims = Claims(
         message.agent_id,
-        boxes,
-        variance.sqrt(),
-        (origin[0], origin[1]),
+        np.concatenate(columns, 1),
+        velocity @ rotation[:2, :2].T,
+        array["score"][rows],
+        np.sqrt(variance),
+        (float(origin[0]), float(origin[1])),
         seconds,
-        message.objects is not None and message.tokens is None and math.isfinite(x + y + yaw),
+        message.objects is not None and message.tokens is None,
     )
+    is_finite = np.isfinite(claims.columns).all(1) & np.isfinite(claims.sigma_m)
+    return claims if is_finite.all() else claims[is_finite]
+
+
+def _stated_boxes(cache: PerceptionCache, message: Message) -> Boxes:
+    """Return the boxes that a message sends, or that its tokens propose, in its sender's frame."""
+    if message.objects is not None:
+        return message.objects
+    tokens, detector = message.tokens, cache.detector
+    if tokens is None or not has_tokens(detector) or tokens.features.shape[1] < PROPOSAL_DIM:
+        return Boxes.empty()
+    raw = RawBoxes.of(tokens.features[:, -PROPOSAL_DIM:].float(), tokens.sites)
+    return decode(raw, replace(detector.decode_config, score_threshold=MIN_SCORE))[0]

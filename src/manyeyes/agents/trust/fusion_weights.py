@@ -48,9 +48,9 @@ def weigh_message(frame: AgentFrame, message: Message, weight: float, claims: As
     The score of an object is multiplied by the square root of the weight, in (0, 1]; the heat logit of a token is increased by the
     logarithm of the weight. A message of weight 1 without refuted claims is returned as it is.
     """
-    refuted = None if claims is None else claims.boxes[claims.evidence == Evidence.REFUTED]
-    if refuted is not None and len(refuted):
-        message = _remove_near(frame, message, refuted.center[:, :2].double())
+    is_refuted = None if claims is None else claims.kinds == Evidence.REFUTED
+    if claims is not None and is_refuted is not None and is_refuted.any():
+        message = _remove_near(frame, message, torch.from_numpy(claims.claims.xy[is_refuted]))
     if weight >= 1.0:
         return message
     objects, tokens = message.objects, message.tokens

@@ -9,6 +9,9 @@ from enum import Enum, IntEnum
 from functools import cached_property
 from typing import Protocol
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from manyeyes.agents.trust.claims import Claims
@@ -54,11 +57,25 @@ class SenderAssessment:
 
 @dataclass(frozen=True)
 class AssessedClaims:
-    """Claims of one sender, in the ego's frame at its time, and the Evidence (N,) uint8 on each."""
+    """Claims of one sender, in the ego's levelled frame at its time, and the Evidence (N,) uint8 on each."""
 
-    agent_id: int
-    boxes: Boxes
-    evidence: Tensor
+    claims: Claims
+    kinds: NDArray[np.uint8]
+
+    @property
+    def agent_id(self) -> int:
+        """The sender."""
+        return self.claims.agent_id
+
+    @property
+    def boxes(self) -> Boxes:
+        """The claimed boxes (N)."""
+        return self.claims.boxes
+
+    @property
+    def evidence(self) -> Tensor:
+        """The Evidence (N,) uint8 on each box."""
+        return torch.from_numpy(self.kinds)
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from manyeyes.agents.trust.interface import AssessedClaims, Assessment, Evidence
+from manyeyes.agents.trust.association import find_nearest
+from manyeyes.agents.trust.interface import Assessment, Evidence
 from manyeyes.datatypes import Boxes
 
 SAME_PLACE_M = 2.0
@@ -40,40 +43,32 @@ def find_result_evidence(boxes: Boxes, own: Boxes, assessment: Assessment | None
     """Return the evidence on boxes (N) in the ego's frame; None where claims are not assessed. own: its detections."""
     if assessment is None or assessment.claims is None:
         return None
-    xy = boxes.center[:, :2].double()
-    kinds, trust = torch.zeros(len(boxes), dtype=torch.uint8), torch.zeros(len(boxes), dtype=torch.float64)
-    is_near = list[Tensor]()
+    xy = boxes.center[:, :2].double().numpy()
+    kinds, trust = np.zeros(len(xy), np.uint8), np.zeros(len(xy))
     trust_of = {sender.agent_id: sender.trust for sender in assessment.senders}
     used = [claims for claims in assessment.claims if assessment.weights.get(claims.agent_id, 0.0) > 0]
+    is_near = list[NDArray[np.bool_]]()
     for claims in used:
-        near, kind = _find_claims_near(xy, claims)
+        is_used = claims.kinds != Evidence.REFUTED
+        nearest = find_nearest(xy, claims.claims.xy[is_used], SAME_PLACE_M)
+        is_near.append(nearest >= 0)
         # Of several claims at one place, the one of the highest value decides.
-        kinds = torch.maximum(kinds, kind)
-        trust = torch.where(near, trust.clamp_min(trust_of[claims.agent_id]), trust)
-        is_near.append(near)
-    mine = own[own.score >= MIN_OWN_SCORE].center[:, :2].double()
-    is_own = (torch.cdist(xy, mine) <= OWN_PLACE_M).any(1)
+        kinds = np.maximum(kinds, np.append(claims.kinds[is_used], np.uint8(0))[nearest])
+        trust = np.maximum(trust, is_near[-1] * trust_of[claims.agent_id])
+    is_own = find_nearest(xy, own.center[own.score >= MIN_OWN_SCORE, :2].double().numpy(), OWN_PLACE_M) >= 0
     kinds[is_own], trust[is_own] = Evidence.OWN, 1.0
-    return ResultEvidence(kinds, _collect_senders([claims.agent_id for claims in used], is_near, len(boxes)), trust)
+    senders = _collect_senders([claims.agent_id for claims in used], is_near, len(xy))
+    return ResultEvidence(torch.from_numpy(kinds), senders, torch.from_numpy(trust))
 
 
-def _find_claims_near(xy: Tensor, claims: AssessedClaims) -> tuple[Tensor, Tensor]:
-    """Return (N,) bool, whether a claim that is not refuted is near each place (N, 2), and (N,) uint8, the evidence on it."""
-    is_used = claims.evidence != Evidence.REFUTED
-    evidence, places = claims.evidence[is_used], claims.boxes.center[is_used, :2].double()
-    if not len(places):
-        return torch.zeros(len(xy), dtype=torch.bool), torch.zeros(len(xy), dtype=torch.uint8)
-    nearest = torch.cdist(xy, places).min(1)
-    near = nearest.values <= SAME_PLACE_M
-    return near, torch.where(near, evidence[nearest.indices], 0)
-
-
-def _collect_senders(agent_ids: Sequence[int], is_near: Sequence[Tensor], count: int) -> tuple[tuple[int, ...], ...]:
-    found: list[list[int]] = [[] for _ in range(count)]
+def _collect_senders(
+    agent_ids: Sequence[int], is_near: Sequence[NDArray[np.bool_]], count: int
+) -> tuple[tuple[int, ...], ...]:
+    found: list[tuple[int, ...]] = [()] * count
     for agent_id, near in zip(agent_ids, is_near):
-        for row in near.nonzero()[:, 0].tolist():
-            found[row].append(agent_id)
-    return tuple(map(tuple, found))
+        for row in np.flatnonzero(near).tolist():
+            found[row] += (agent_id,)
+    return tuple(found)
 
 
 def bound_scores(boxes: Boxes, evidence: ResultEvidence) -> tuple[Boxes, ResultEvidence]:
@@ -82,11 +77,13 @@ def bound_scores(boxes: Boxes, evidence: ResultEvidence) -> tuple[Boxes, ResultE
     MAX_UNCHECKED_SCORE bounds the score of a disputed box, and of an unchecked one that rests on one sender without a trust of
     MIN_TRUST.
     """
-    is_single = torch.tensor([len(senders) == 1 for senders in evidence.senders], dtype=torch.bool)
-    is_unchecked = (evidence.kinds == Evidence.UNCHECKED) & is_single & (evidence.trust < MIN_TRUST)
+    is_unchecked = (evidence.kinds == Evidence.UNCHECKED) & (evidence.trust < MIN_TRUST)
     is_bounded = is_unchecked | (evidence.kinds == Evidence.DISPUTED)
-    if not bool((boxes.score[is_bounded] > MAX_UNCHECKED_SCORE).any()):
+    rows = (is_bounded & (boxes.score > MAX_UNCHECKED_SCORE)).nonzero()[:, 0].tolist()
+    rows = [row for row in rows if len(evidence.senders[row]) == 1 or evidence.kinds[row] == Evidence.DISPUTED]
+    if not rows:
         return boxes, evidence
-    score = torch.where(is_bounded, boxes.score.clamp_max(MAX_UNCHECKED_SCORE), boxes.score)
+    score = boxes.score.clone()
+    score[rows] = MAX_UNCHECKED_SCORE
     order = score.argsort(descending=True, stable=True)
     return replace(boxes, score=score)[order], evidence[order]

@@ -6,19 +6,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from manyeyes.agents.isolation import Quarantine
 from manyeyes.agents.trust.association import Floats
 from manyeyes.agents.trust.beta_trust import BetaTrust, TrustConfig, decay
 from manyeyes.agents.trust.claim_tracks import ClaimTracks, move_tracks
 from manyeyes.agents.trust.disputes import Disputes
 from manyeyes.agents.trust.omissions import OwnObjects
-from manyeyes.datatypes import AgentFrame, Boxes, Transform
+from manyeyes.datatypes import AgentFrame, Transform
 
 MAX_SENDERS = 256
 MAX_SILENCE_NS = 60_000_000_000
 """A sender that was silent for longer is forgotten: its trust has decayed to the prior."""
+NEVER_NS = -(1 << 63)
 MAX_GAP_NS = 1_000_000_000
 """After a longer gap of the ego's frames positions are forgotten; trust is not."""
 
@@ -36,6 +35,10 @@ class SenderMemory:
     tracks: ClaimTracks
     omitted: OwnObjects
     reason: str = ""
+
+
+UNKNOWN_SENDER = SenderMemory(BetaTrust(*TrustConfig().prior), 0, NEVER_NS, ClaimTracks.empty(), OwnObjects.empty())
+"""Before the first message of a sender."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +65,11 @@ class TrustState:
         return decay(memory.trust, (self.now_ns - memory.updated_ns) * 1e-9, config)
 
 
-def advance(
-    state: TrustState, frame: AgentFrame, own: Boxes, min_own_score: float
-) -> tuple[TrustState, Floats, Floats]:
-    """Return the state in the ego's frame of now, and the motion to it: rotation (2, 2) and shift (2,)."""
+def advance(state: TrustState, frame: AgentFrame, own: OwnObjects) -> tuple[TrustState, Floats, Floats]:
+    """Return the state in the ego's frame of now, and the motion to it: rotation (2, 2) and shift (2,). own: objects of now."""
     gap_ns, odometry = frame.timestamp_ns - state.now_ns, frame.odometry or frame.world_from_agent
     motion = odometry.inverse() @ state.odometry
-    rotation, shift = motion.rotation[:2, :2].double().numpy(), motion.translation[:2].double().numpy()
+    rotation, shift = motion.rotation[:2, :2].numpy(), motion.translation[:2].numpy()
     is_continued = 0 <= gap_ns <= MAX_GAP_NS
     seconds = gap_ns * 1e-9 if is_continued else 0.0
     senders = {
@@ -79,10 +80,9 @@ def advance(
         if abs(frame.timestamp_ns - memory.updated_ns) <= MAX_SILENCE_NS
     }
     disputes = state.disputes.move(rotation, shift, frame.timestamp_ns) if is_continued else Disputes.empty()
-    objects = state.own if is_continued else OwnObjects.empty()
-    objects = objects.follow(own, rotation, shift, seconds, min_own_score)
-    moved = TrustState(frame.timestamp_ns, odometry, objects, senders, state.exclusions, disputes)
-    return moved, rotation, np.asarray(shift)
+    before = state.own if is_continued else OwnObjects.empty()
+    objects = before.follow(own, rotation, shift, seconds)
+    return TrustState(frame.timestamp_ns, odometry, objects, senders, state.exclusions, disputes), rotation, shift
 
 
 def forget_oldest(senders: Mapping[int, SenderMemory]) -> Mapping[int, SenderMemory]:

@@ -43,23 +43,23 @@ def sort_by_direction(points: F32x2, origin: F64x1) -> tuple[I64x1, I64x1]:  # p
 
 
 @njit(cache=True, nogil=True)
-def count_rays(points: F32x2, origin: F64x1, boxes: F64x2, shrink_m: F64x1, limits: F64x1) -> I64x2:  # pragma: no cover
+def count_rays(points: F32x2, origin: F64x1, boxes: F64x2, margin_m: F64x1, limits: F64x1) -> I64x2:  # pragma: no cover
     """Return (K, 2), passing rays and hits of boxes (K, 7: centre, size, yaw). limits: the constants of ``box_rays``, in order."""
     out = np.zeros((len(boxes), 2), np.int64)
     if len(boxes) == 0 or len(points) == 0:
         return out
     order, first = sort_by_direction(points, origin)
-    bottom, top, behind, grow = limits[0], limits[1], limits[2], limits[3]
+    bottom, top, behind = limits[0], limits[1], limits[2]
     low, high, start, step = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for k in range(len(boxes)):
         cosine, sine = math.cos(boxes[k, 6]), math.sin(boxes[k, 6])
         dx, dy = origin[0] - boxes[k, 0], origin[1] - boxes[k, 1]
         start[0], start[1], start[2] = dx * cosine + dy * sine, dy * cosine - dx * sine, origin[2] - boxes[k, 2]
         half_length, half_width, half_height = boxes[k, 3] / 2, boxes[k, 4] / 2, boxes[k, 5] / 2
-        reach_x, reach_y = half_length + grow, half_width + grow
+        reach_x, reach_y = half_length + margin_m[k], half_width + margin_m[k]
         if abs(start[0]) <= reach_x and abs(start[1]) <= reach_y:
             continue
-        high[0], high[1], high[2] = half_length - shrink_m[k], half_width - shrink_m[k], half_height - top
+        high[0], high[1], high[2] = half_length - margin_m[k], half_width - margin_m[k], half_height - top
         low[0], low[1], low[2] = -high[0], -high[1], -half_height + bottom
         has_core = high[0] > 0 and high[1] > 0 and high[2] > low[2]
         middle = _direction(-dx, -dy)
@@ -81,7 +81,7 @@ def count_rays(points: F32x2, origin: F64x1, boxes: F64x2, shrink_m: F64x1, limi
                     continue
                 dx, dy = points[i, 0] - boxes[k, 0], points[i, 1] - boxes[k, 1]
                 x, y, z = dx * cosine + dy * sine, dy * cosine - dx * sine, points[i, 2] - boxes[k, 2]
-                if abs(x) <= reach_x and abs(y) <= reach_y and low[2] <= z <= half_height + grow:
+                if abs(x) <= reach_x and abs(y) <= reach_y and low[2] <= z <= half_height + top:
                     out[k, 1] += 1
                 if not has_core:
                     continue

@@ -13,41 +13,48 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from manyeyes._jit import F32x2, F64x1, F64x2, I64x2
 from manyeyes.datatypes import Boxes
 from manyeyes.ops.lidar._box_ray_kernels import count_rays
 
 BOTTOM_M, TOP_M = 0.4, 0.3
-"""Rays nearer to the bottom or to the top of a box are not counted: the ground, and errors of its height."""
+"""Rays nearer to the bottom or to the top of a box do not count as passing: the ground, and errors of its height. Returns hit it
+from BOTTOM_M above its bottom to TOP_M above its top."""
 MIN_BEHIND_M = 0.5
 """A ray passes if it returns from at least this far behind the core of a box."""
-GROW_M = 0.3
-"""A ray hits if it returns from the box, enlarged by this."""
-_LIMITS = np.array([BOTTOM_M, TOP_M, MIN_BEHIND_M, GROW_M])
+_LIMITS = np.array([BOTTOM_M, TOP_M, MIN_BEHIND_M])
 
 
 class BoxRays(NamedTuple):
-    """Rays of K boxes. num_passing: (K,) int64, through the core, from behind it. num_hits: (K,) int64, from the box."""
+    """Rays of K boxes. num_passing: (K,) int64, through the core, from behind it. num_hits: (K,) int64, from the hull."""
 
     num_passing: Tensor
     num_hits: Tensor
 
 
-def count_box_rays(points: Tensor, origin: Tensor, boxes: Boxes, shrink_m: Tensor) -> BoxRays:
+def count_box_rays(points: Tensor, origin: Tensor, boxes: Boxes, margin_m: Tensor) -> BoxRays:
     """Count the rays that pass through and that hit each box.
 
     Args:
         points: (N, 3) returns. origin: (3,) of all rays. Both in the frame of the boxes, metres.
-        boxes: (K,). A box that contains the origin, enlarged by GROW_M, has no rays.
-        shrink_m: (K,) by how much the core of each box is smaller than its footprint on every side.
+        boxes: (K,). A box whose enlarged footprint contains the origin has no rays.
+        margin_m: (K,) error of each position: rays pass through a core whose footprint is smaller by it on every side, and hit a
+            hull whose footprint is larger by it.
     """
     columns = torch.cat((boxes.center, boxes.size, boxes.yaw[:, None]), 1).double().numpy()
     xyz = np.ascontiguousarray(points.float().numpy())
-    found = count_rays(xyz, origin.double().numpy(), columns, shrink_m.double().numpy(), _LIMITS)
+    found = count_rays(xyz, origin.double().numpy(), columns, margin_m.double().numpy(), _LIMITS)
     passing, hits = torch.from_numpy(found).unbind(1)
     return BoxRays(passing, hits)
 
 
-def count_box_rays_reference(points: Tensor, origin: Tensor, boxes: Boxes, shrink_m: Tensor) -> BoxRays:
+def count_rays_of_columns(xyz: F32x2, sensor_height_m: float, boxes: F64x2, margin_m: F64x1) -> I64x2:
+    """Return (K, 2), passing rays and hits, of boxes (K, 7: centre, size, yaw) and returns (N, 3), of an agent's LiDAR."""
+    origin = np.array([0.0, 0.0, sensor_height_m])
+    return count_rays(np.ascontiguousarray(xyz, np.float32), origin, boxes, margin_m, _LIMITS)
+
+
+def count_box_rays_reference(points: Tensor, origin: Tensor, boxes: Boxes, margin_m: Tensor) -> BoxRays:
     """Do the same with every ray of every box: the slab test of Kay and Kajiya (SIGGRAPH 1986)."""
     passing, hits = list[int](), list[int]()
     for row in range(len(boxes)):
@@ -58,13 +65,13 @@ def count_box_rays_reference(points: Tensor, origin: Tensor, boxes: Boxes, shrin
             for delta in (places.double() - boxes.center[row].double() for places in (origin[None], points))
         )
         half = boxes.size[row].double() / 2
-        if (start[0, :2].abs() <= half[:2] + GROW_M).all():
+        if (start[0, :2].abs() <= half[:2] + margin_m[row]).all():
             passing.append(0)
             hits.append(0)
             continue
-        is_hit = (end[:, :2].abs() <= half[:2] + GROW_M).all(1)
-        hits.append(int((is_hit & (end[:, 2] >= BOTTOM_M - half[2]) & (end[:, 2] <= half[2] + GROW_M)).sum()))
-        high = torch.cat((half[:2] - shrink_m[row], half[2:] - TOP_M))
+        is_hit = (end[:, :2].abs() <= half[:2] + margin_m[row]).all(1)
+        hits.append(int((is_hit & (end[:, 2] >= BOTTOM_M - half[2]) & (end[:, 2] <= half[2] + TOP_M)).sum()))
+        high = torch.cat((half[:2] - margin_m[row], half[2:] - TOP_M))
         low = torch.cat((-high[:2], BOTTOM_M - half[2:]))
         step = end - start
         one, two = (low - start) / step, (high - start) / step

@@ -8,13 +8,15 @@ change no trust.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from manyeyes.agents.isolation import Quarantine
 from manyeyes.agents.trust.association import Floats
 from manyeyes.agents.trust.beta_trust import BetaTrust, TrustConfig, fusion_weight, update
 from manyeyes.agents.trust.claim_evidence import CheckedClaims, EvidenceConfig, check_claims
@@ -28,9 +30,10 @@ from manyeyes.agents.trust.interface import (
     SenderAssessment,
     SenderStatus,
 )
-from manyeyes.agents.trust.omissions import OmissionConfig, OwnObjects, count_omitted, find_omitted
+from manyeyes.agents.trust.omissions import OmissionConfig, OwnObjects, find_unclaimed, is_in_sight, make_probes
 from manyeyes.agents.trust.registry import register_misbehaviour_detector
-from manyeyes.agents.trust.sender_state import SenderMemory, TrustState, advance, forget_oldest
+from manyeyes.agents.trust.sender_state import UNKNOWN_SENDER, SenderMemory, TrustState, advance, forget_oldest
+from manyeyes.datatypes import Boxes, Message
 
 LOW_TRUST = "low trust"
 
@@ -70,96 +73,105 @@ class RayEvidenceDetector(MisbehaviourDetector):
     def assess(self, received: MisbehaviourInput, state: object | None) -> Assessment:
         """Assess claims, update trust and exclusions; all before fusion of the same frame."""
         before = state if isinstance(state, TrustState) else TrustState.start(received.frame)
-        now, rotation, shift = advance(before, received.frame, received.own, self.omissions.min_score)
-        checked = self._check(received, now)
-        looks = {one.claims.agent_id: self._look(one, now) for one in checked}
+        now, rotation, shift = advance(before, received.frame, _own_objects(received.own, self.omissions.min_score))
+        unclaimed = [
+            _memory(now, one.agent_id).omitted.follow(
+                find_unclaimed(now.own, one, self.omissions), rotation, shift, 0.0
+            )
+            for one in received.claims
+        ]
+        checked, omits = self._check(received, now, unclaimed)
+        looks = [self._look(one, now) for one in checked]
         now = replace(now, disputes=now.disputes.add(self._find_disputes(checked, looks, now), now.now_ns))
-        looks = {
-            one.claims.agent_id: _mark_disputed(looks[one.claims.agent_id], now.disputes.cover(one.xy))
-            for one in checked
-        }
-        num_claims = sum(len(one.xy) for one in checked)
-        senders, assessments, exclusions = dict(now.senders), list[SenderAssessment](), now.exclusions
-        for one, message in zip(checked, received.messages):
+        looks = [_mark_disputed(look, now.disputes.cover(look.xy)) for look in looks]
+        num_claims = sum(len(look.xy) for look in looks)
+        senders, exclusions, assessments = dict(now.senders), now.exclusions, list[SenderAssessment]()
+        for message, look, omitted, is_omitting in zip(received.messages, looks, unclaimed, omits):
             agent_id, is_faulty = message.agent_id, message.agent_id in received.faulty
-            found = find_omitted(received.frame, received.own, now.own, one.claims, self.omissions)
-            memory = senders.get(agent_id)
-            omitted = count_omitted(OwnObjects.empty() if memory is None else memory.omitted, found, rotation, shift)
-            memory = self._update_sender(now, agent_id, message.timestamp_ns, looks[agent_id], omitted, is_faulty)
-            named = "" if is_faulty else self._find_reason(memory.tracks, num_claims)
-            is_low = memory.trust.mean < self.trust.min_trust and not is_faulty
-            was_excluded = bool(memory.reason)
-            is_excluded = exclusions.contains(agent_id, now.now_ns)
-            if not is_excluded and (named or (is_low and not was_excluded)):
-                exclusions, is_excluded = exclusions.add(agent_id, now.now_ns), True
-                memory = replace(memory, reason=named or LOW_TRUST)
-            elif was_excluded and not is_excluded:
-                memory = replace(memory, trust=BetaTrust(*self.trust.returned), reason="")
+            memory = self._update_sender(now, message, look, is_omitting, is_faulty)
+            memory, exclusions = self._decide(
+                agent_id, replace(memory, omitted=omitted), exclusions, now, num_claims, is_faulty
+            )
             senders[agent_id] = memory
+            is_excluded = exclusions.contains(agent_id, now.now_ns)
             assessments.append(self._assess_sender(agent_id, memory, is_excluded, is_faulty))
-        state = replace(now, senders=forget_oldest(senders), exclusions=exclusions)
-        claims = tuple(
-            AssessedClaims(one.claims.agent_id, one.claims.boxes, torch.from_numpy(looks[one.claims.agent_id].evidence))
-            for one in checked
+        claims = tuple(AssessedClaims(one.claims, look.evidence) for one, look in zip(checked, looks))
+        return Assessment(
+            tuple(assessments), claims, replace(now, senders=forget_oldest(senders), exclusions=exclusions)
         )
-        return Assessment(tuple(assessments), claims, state)
 
-    def _check(self, received: MisbehaviourInput, now: TrustState) -> tuple[CheckedClaims, ...]:
-        """Return the evidence on all claims; excluded senders corroborate nothing."""
+    def _check(
+        self, received: MisbehaviourInput, now: TrustState, unclaimed: Sequence[OwnObjects]
+    ) -> tuple[tuple[CheckedClaims, ...], list[bool]]:
+        """Return the evidence on all claims, and whether each sender omits an object; excluded senders corroborate nothing."""
         excluded = self.excluded(now, received.agent_ids, now.now_ns)
         trust = {a: now.trust_of(a, self.trust).mean for a in received.agent_ids if a not in excluded}
-        return check_claims(received.frame, received.own, received.claims, trust, self.evidence)
+        probes = [make_probes(one, c.sender_xy, self.omissions) for one, c in zip(unclaimed, received.claims)]
+        own = received.own.center[received.own.score >= self.evidence.min_own_score, :2].double().numpy()
+        checked, rays = check_claims(
+            received.frame, own, received.claims, trust, self.evidence, np.concatenate([np.zeros((0, 7)), *probes])
+        )
+        ends = np.cumsum([0, *map(len, probes)])
+        return checked, [is_in_sight(rays[a:b], self.omissions) for a, b in pairwise(ends)]
+
+    def _decide(
+        self,
+        agent_id: int,
+        memory: SenderMemory,
+        exclusions: Quarantine,
+        now: TrustState,
+        num_claims: int,
+        is_faulty: bool,
+    ) -> tuple[SenderMemory, Quarantine]:
+        """Begin or end the exclusion of a sender."""
+        named = "" if is_faulty else self._find_reason(memory.tracks, num_claims)
+        is_low = memory.trust.mean < self.trust.min_trust and not is_faulty
+        if exclusions.contains(agent_id, now.now_ns):
+            return memory, exclusions
+        if named or (is_low and not memory.reason):
+            return replace(memory, reason=named or LOW_TRUST), exclusions.add(agent_id, now.now_ns)
+        if memory.reason:
+            memory = replace(memory, trust=BetaTrust(*self.trust.returned), reason="")
+        return memory, exclusions
 
     def _look(self, one: CheckedClaims, now: TrustState) -> ClaimLooks:
         """Associate claims with the tracks of their sender."""
-        memory = now.senders.get(one.claims.agent_id)
-        tracks = ClaimTracks.empty() if memory is None else memory.tracks
-        velocity = one.claims.boxes.velocity.double().numpy()
-        return ClaimLooks(one.xy, velocity, one.score, one.kinds, find_tracks(tracks, one.xy, one.sigma_m))
+        claims, tracks = one.claims, _memory(now, one.claims.agent_id).tracks
+        track = find_tracks(tracks, claims.xy, claims.sigma_m)
+        return ClaimLooks(claims.xy, claims.velocity, claims.score, one.kinds, track)
 
-    def _find_disputes(
-        self, checked: tuple[CheckedClaims, ...], looks: Mapping[int, ClaimLooks], now: TrustState
-    ) -> Floats:
+    def _find_disputes(self, checked: Sequence[CheckedClaims], looks: Sequence[ClaimLooks], now: TrustState) -> Floats:
         """Return places (N, 2) where a trusted third agent contradicts the ego, or the ego's evidence turned."""
         places = [np.zeros((0, 2))]
-        for one in checked:
+        for one, look in zip(checked, looks):
             is_refuted, is_supported = one.kinds == Evidence.REFUTED, one.kinds == Evidence.SUPPORTED
-            disputed = is_refuted & one.corroborated
-            memory, track = now.senders.get(one.claims.agent_id), looks[one.claims.agent_id].track
-            if memory is not None and len(memory.tracks):
-                rows, is_known = track.clip(0), track >= 0
-                turned = is_refuted & self._is_recent(memory.tracks.supported_ns[rows], now.now_ns)
-                turned |= is_supported & self._is_recent(memory.tracks.refuted_ns[rows], now.now_ns)
-                disputed |= turned & is_known
-            places.append(one.xy[disputed])
+            disputed, tracks = is_refuted & one.corroborated, _memory(now, one.claims.agent_id).tracks
+            if len(tracks):
+                rows = look.track.clip(0)
+                turned = is_refuted & self._is_recent(tracks.supported_ns[rows], now.now_ns)
+                turned |= is_supported & self._is_recent(tracks.refuted_ns[rows], now.now_ns)
+                disputed |= turned & (look.track >= 0)
+            places.append(look.xy[disputed])
         return np.concatenate(places)
 
     def _is_recent(self, time_ns: NDArray[np.int64], now_ns: int) -> NDArray[np.bool_]:
         return (time_ns > 0) & (np.abs(now_ns - time_ns) <= self.naming.sign_change_ns)
 
     def _update_sender(
-        self,
-        now: TrustState,
-        agent_id: int,
-        captured_ns: int,
-        looks: ClaimLooks,
-        omitted: OwnObjects,
-        is_faulty: bool,
+        self, now: TrustState, message: Message, looks: ClaimLooks, is_omitting: bool, is_faulty: bool
     ) -> SenderMemory:
         """Return the memory of a sender after its claims of this frame; a message that was assessed before adds nothing."""
-        trust, memory = now.trust_of(agent_id, self.trust), now.senders.get(agent_id)
-        if memory is not None and memory.captured_ns == captured_ns:
+        trust, memory = now.trust_of(message.agent_id, self.trust), _memory(now, message.agent_id)
+        if memory.captured_ns == message.timestamp_ns:
             return replace(memory, trust=trust, updated_ns=now.now_ns)
         kinds, score = looks.evidence, looks.score
         is_support = (kinds == Evidence.SUPPORTED) | (kinds == Evidence.CORROBORATED)
         is_fault = (kinds == Evidence.REFUTED) & (score >= self.naming.min_score)
-        fault = self.trust.refuted * float(score[is_fault].sum())
-        fault += self.trust.omitted * int((omitted.num_frames >= self.omissions.min_missing).sum())
-        support = float(score[is_support].sum())
-        trust = update(trust, 0.0 if is_faulty else support, 0.0 if is_faulty else fault, self.trust)
-        before = ClaimTracks.empty() if memory is None else memory.tracks
-        tracks, reason = update_tracks(before, looks, now.now_ns), "" if memory is None else memory.reason
-        return SenderMemory(trust, now.now_ns, captured_ns, tracks, omitted, reason)
+        fault = self.trust.refuted * float(score[is_fault].sum()) + self.trust.omitted * is_omitting
+        if not is_faulty:
+            trust = update(trust, float(score[is_support].sum()), fault, self.trust)
+        tracks = update_tracks(memory.tracks, looks, now.now_ns)
+        return SenderMemory(trust, now.now_ns, message.timestamp_ns, tracks, memory.omitted, memory.reason)
 
     def _find_reason(self, tracks: ClaimTracks, num_claims: int) -> str:
         """Return why a sender is named malicious, or nothing."""
@@ -181,6 +193,17 @@ class RayEvidenceDetector(MisbehaviourDetector):
         status = SenderStatus.FAULTY if is_faulty else SenderStatus.NORMAL
         reason = "its poses have an offset or a drift" if is_faulty else ""
         return SenderAssessment(agent_id, trust, fusion_weight(trust, self.trust), status, reason)
+
+
+def _memory(state: TrustState, agent_id: int) -> SenderMemory:
+    return state.senders.get(agent_id, UNKNOWN_SENDER)
+
+
+def _own_objects(own: Boxes, min_score: float) -> OwnObjects:
+    """Return the detections (K) of the ego of a score, as objects of one frame."""
+    kept = own.score >= min_score
+    columns = torch.cat((own.center[kept], own.size[kept], own.yaw[kept, None]), 1).double().numpy()
+    return OwnObjects(columns, own.velocity[kept].double().numpy(), np.ones(len(columns), np.int64))
 
 
 def _mark_disputed(looks: ClaimLooks, is_disputed: NDArray[np.bool_]) -> ClaimLooks:
