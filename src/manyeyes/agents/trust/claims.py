@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -79,21 +79,24 @@ def _extract(frame: AgentFrame, cache: PerceptionCache, message: Message) -> Cla
     ego_from_other, seconds = ego_from_sender(frame, message), age_s(frame, message)
     rotation, origin = ego_from_other.rotation.numpy(), ego_from_other.translation.numpy()
     boxes = _stated_boxes(cache, message)
-    array = {f.name: getattr(boxes, f.name).numpy().astype(np.float64) for f in fields(boxes)}
-    rows = np.argsort(-array["score"], kind="stable")[:MAX_CLAIMS]
-    rows = rows[array["score"][rows] >= MIN_SCORE]
-    center, velocity = array["center"][rows], array["velocity"][rows]
+    scores = boxes.score.double().numpy()
+    rows = np.argsort(-scores, kind="stable")[:MAX_CLAIMS]
+    rows = rows[scores[rows] >= MIN_SCORE]
+    center, size, box_yaw, velocity, sigma_xy = (
+        column.double().numpy()[rows]
+        for column in (boxes.center, boxes.size, boxes.yaw, boxes.velocity, boxes.sigma_xy)
+    )
     x, y, yaw = np.diagonal((frame.pose_covariance + message.pose_covariance).double().numpy()).clip(0).tolist()
     variance = (x + y) / 2 + yaw * (center[:, :2] ** 2).sum(1)
-    variance += array["sigma_xy"][rows] ** 2 + (SIGMA_VELOCITY_MPS * seconds) ** 2
+    variance += sigma_xy**2 + (SIGMA_VELOCITY_MPS * seconds) ** 2
     center[:, :2] += velocity * seconds
     turn = math.atan2(rotation[1, 0], rotation[0, 0])
-    columns = (center @ rotation.T + origin, array["size"][rows], (array["yaw"][rows] + turn)[:, None])
+    columns = (center @ rotation.T + origin, size, (box_yaw + turn)[:, None])
     claims = Claims(
         message.agent_id,
         np.concatenate(columns, 1),
         velocity @ rotation[:2, :2].T,
-        array["score"][rows],
+        scores[rows],
         np.sqrt(variance),
         (float(origin[0]), float(origin[1])),
         seconds,
