@@ -24,6 +24,8 @@ MODULES = {
     "small_gicp": "small-gicp",
     "zenoh": "eclipse-zenoh",
     "llvmlite": "numba",
+    "prometheus_client": "prometheus-client",
+    "rerun": "rerun-sdk",
 }
 """Modules whose package on the index has another name; numba brings llvmlite of its own version."""
 

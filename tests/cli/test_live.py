@@ -58,9 +58,11 @@ def test_a_team_runs_ends_and_is_computed_again(drive, weights, tmp_path, capfd,
     assert len(summaries) == 2 and all(s.frames >= 1 and s.sent_bytes > 0 and s.recording > 0 for s in summaries)
     assert sum(s.fused for s in summaries) > 0
     again = tmp_path / "o" / "agent-5.mcap"
-    assert run("live", "replay", again, "--security", "off") == 0
-    assert run("live", "replay", again, "--security", "off", "--check") == 1
-    assert "leave --security out" in capfd.readouterr().err
+    assert run("live", "replay", again, "--what-if", "security=off", "strategy=late") == 0
+    recorded, changed = capfd.readouterr().out.splitlines()[1:]
+    assert "other than recorded in 0 of" in recorded and "security=off strategy=late: 0.00 messages fused" in changed
+    assert run("live", "replay", again, "--what-if", "security=off", "--check") == 1
+    assert "leave --what-if out" in capfd.readouterr().err
 
 
 @pytest.mark.slow

@@ -97,6 +97,12 @@ CASES = [
     ("live run d", "zenoh", "live run with transport zenoh needs the 'live' extra: pip install 'manyeyes[live]'"),
     ("live run d --record r.mcap", "mcap", "live run with record needs the 'live' extra"),
     ("live run d --transport udp --security warn", "cryptography", "live run with security warn, require needs"),
+    (
+        "live run d --transport udp --metrics 127.0.0.1:1",
+        "prometheus_client",
+        "live run with metrics needs the 'metrics' extra",
+    ),
+    ("live map --transport udp", "pyarrow", "live map needs the 'map' extra"),
     ("live demo", "zenoh", "live demo needs the 'live' extra"),
     ("live replay r.mcap", "mcap", "live replay needs the 'live' extra"),
     ("keys anchor", "cryptography", "keys anchor needs the 'live' extra: pip install 'manyeyes[live]'"),

@@ -26,6 +26,7 @@ from manyeyes.runtime.security import Security
 from manyeyes.runtime.summary import RunStatistics
 from manyeyes.runtime.transports.local import LocalNetwork
 from manyeyes.runtime.trust_file import Revocations
+from manyeyes.runtime.what_if import parse_changes
 
 START_NS, MS, TENTH_NS = START_S * 10**9, 10**6, 10**8
 CONFIG = RunConfig("tiny", "", "intermediate", 4_096, None, "require", {}, 1)
@@ -116,7 +117,7 @@ def test_a_recorded_run_is_computed_again_bit_for_bit(team: Team) -> None:
         for pair, again in zip(ticks, replayed):
             assert torch.equal(boxes_of(pair[k].perception), boxes_of(again.perception))
     # Without the check of signatures signed packets are not read: another result, and it is noticed.
-    without = list(replay_run(path, lambda config: team.agent(), "off"))
+    without = list(replay_run(path, lambda config: team.agent(), parse_changes(["security=off"])))
     assert not any(tick.perception.received for tick in without) and not all(tick.same_result for tick in without)
 
 

@@ -28,7 +28,7 @@ COMMANDS = {
     "view": "draw a frame of a recording, or animate a drive",
     "pose": "evaluate pose correction from detected objects: prior and corrected poses",
     "map": "one map from many drives: build, simulate, fuse, evaluate, diff, export, view, import, retract",
-    "live": "agents as processes on a network: run one, demo of a team, replay of a recorded run",
+    "live": "agents as processes on a network: run one, demo of a team, map server, replay of a recorded run",
     "keys": "keys and certificates of agents on a network: make, issue, verify, revoke",
     "study": "reproduce a table or figure: robustness, bandwidth, pose noise, map fusion, ...",
     "report": "documents of results, and checks of them: docs, check-cells",
@@ -49,6 +49,7 @@ COMMAND_GROUPS = {
     "live": {
         "run": "run one agent on a network, on the frames of a recording in real time",
         "demo": "run a whole team on this machine, a process for each agent",
+        "map": "run a map server on the network: local maps of agents are fused to one map",
         "replay": "compute a recorded run again, and compare bit for bit",
     },
     "keys": {

@@ -22,6 +22,8 @@ EXTRAS = {
     "ros": ("rosbags",),
     "train": ("tensorboard", "matplotlib", "PIL"),
     "live": ("cryptography", "zenoh", "mcap"),
+    "metrics": ("prometheus_client",),
+    "rerun": ("rerun",),
 }
 """Modules that each extra installs."""
 
@@ -91,7 +93,7 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
     "evaluate": (),
     "replay": (Requirement("view", EXTRAS["view"]),),
     "export": (),
-    "view": (_PILLOW,),
+    "view": (_PILLOW, Requirement("rerun", EXTRAS["rerun"]).when("rerun", "*")),
     "pose": (_GICP,),
     "doctor": (),
     "report docs": (),
@@ -116,8 +118,19 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
         _GEOPACKAGE.when("file", "*.gpkg", "*.pmtiles"),
     ),
     "map view": (_ARROW, _SHAPELY, _MATPLOTLIB.when("out", "*.png")),
-    "live run": (_ZENOH, _CRYPTOGRAPHY.when("security.security", "warn", "require"), _MCAP.when("record", "*")),
-    "live demo": (Requirement("live", EXTRAS["live"]),),
+    "live run": (
+        _ZENOH,
+        _CRYPTOGRAPHY.when("security.security", "warn", "require"),
+        _MCAP.when("record", "*"),
+        Requirement("metrics", EXTRAS["metrics"]).when("metrics", "*"),
+    ),
+    "live demo": (Requirement("live", EXTRAS["live"]), _ARROW.when("map", "True"), _SHAPELY.when("map", "True")),
+    "live map": (
+        _ZENOH,
+        _CRYPTOGRAPHY.when("security.security", "warn", "require"),
+        _ARROW,
+        _SHAPELY,
+    ),
     "live replay": (_MCAP, _CRYPTOGRAPHY),
     "keys anchor": (_CRYPTOGRAPHY,),
     "keys issue": (_CRYPTOGRAPHY,),

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draws a frame of a recording from above (.png), or animates a drive (.gif, .webp), with or without detections."""
+"""Draws a frame of a recording from above (.png), or animates a drive (.gif, .webp), with or without detections.
+
+With --rerun it logs the drive, or a recorded live run (.mcap), in three dimensions for the viewer rerun.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +17,14 @@ from manyeyes.datatypes import ConfigError
 from manyeyes.studies.replay_options import ReplayOptions, make_excerpt
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from PIL.Image import Image
 
     from manyeyes.agents.replay import ReplayConfig
     from manyeyes.datatypes import BevGrid, Boxes, Snapshot
     from manyeyes.studies.replay_options import Excerpt
+    from manyeyes.viz.spatial_frame import SpatialFrame
 
 SUFFIXES = (".png", ".gif", ".webp")
 MAX_PIXELS = 50_000_000
@@ -40,6 +46,8 @@ class Options:
     """At most so many frames of an animation."""
     out: OutputFile = Path("out/view.png")
     """The file: .png for a frame, .gif or .webp for the drive."""
+    rerun: str | None = None
+    """Log the drive for the viewer rerun, instead of drawing: a file .rrd, or the address of a viewer, rerun+http://HOST:PORT/proxy."""
     half_extent_m: tuple[ExtentM, ExtentM] = (70.4, 38.4)
     """How far the picture reaches ahead and aside, metres; with --detect the detector's range counts."""
     width: PixelCount = 1280
@@ -63,6 +71,9 @@ def main(options: Options) -> None:
     from manyeyes.viz.animation import save_animation
     from manyeyes.viz.birds_eye import save_png
 
+    if options.rerun is not None:
+        _log_for_rerun(options, options.rerun)
+        return
     if options.out.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"--out ends in {', '.join(SUFFIXES)}; got {options.out.name}.")
     height = options.width * options.half_extent_m[1] / options.half_extent_m[0]
@@ -89,6 +100,51 @@ def main(options: Options) -> None:
     else:
         save_animation(images, options.out)
     console.print(f"{options.out}: {drive.scenario}, frames {first} to {last - 1}", highlight=False, soft_wrap=True)
+
+
+def _log_for_rerun(options: Options, target: str) -> None:
+    """Log a drive, or a recorded live run (.mcap)."""
+    from itertools import islice
+
+    from rich.console import Console
+
+    from manyeyes.viz.rerun_log import RerunLog
+
+    num = 0
+    with RerunLog(target, options.recording.name) as log:
+        for frame in islice(_make_spatial_frames(options), options.frames):
+            log.add(frame)
+            num += 1
+    Console().print(f"{target}: {num} frames; open it with 'rerun'", highlight=False, soft_wrap=True)
+
+
+def _make_spatial_frames(options: Options) -> Iterator[SpatialFrame]:
+    from manyeyes.agents.replay import DetectionReplay
+    from manyeyes.cli.live.options import make_agent
+    from manyeyes.datasets.registry import open_recording
+    from manyeyes.models import pretrained
+    from manyeyes.studies.recordings import adapt_to_dataset
+    from manyeyes.studies.replay_report import find_min_score
+    from manyeyes.studies.spatial_views import show_run, show_snapshot, show_step
+
+    if options.recording.suffix == ".mcap" and options.recording.is_file():
+        yield from show_run(options.recording, make_agent, options.min_score or 0.0)
+        return
+    recording = open_recording(options.recording, options.split)
+    drive = make_excerpt(recording, options.scenario)
+    first = drive.eval_indices(drive.scenario).start if options.frame is None else options.frame
+    snapshots = (drive.snapshot(drive.scenario, index) for index in range(first, drive.length(drive.scenario)))
+    if options.detect is None:
+        yield from map(show_snapshot, snapshots)
+        return
+    replay_options = replace(options.replay_options, methods=(options.detect,))
+    config = adapt_to_dataset(replay_options.make_replay_config(0), replay_options, recording)
+    detector = pretrained.load(replay_options.weights)
+    min_score = find_min_score(detector, options.detect, options.min_score)
+    player = DetectionReplay(options.detect, detector, config)
+    for snapshot in snapshots:
+        for step in player.step(snapshot):
+            yield show_step(step, min_score)
 
 
 def _draw_images(options: Options, drive: Excerpt, indices: range, config: ReplayConfig | None) -> list[Image]:

@@ -155,6 +155,10 @@ class Inbox:
             if held.last_arrival_ns is not None
         )
 
+    def peek(self) -> tuple[Message, ...]:
+        """Return the newest message of each sender, as far as it came, whatever its age. Nothing changes."""
+        return tuple(held.assembly.message() for held in self._senders.current_messages())
+
     def take_rejections(self) -> tuple[Rejection, ...]:
         """Senders whose tokens were refused since the last call, the last reason of each, by agent id."""
         taken, self._rejections = self._rejections, {}

@@ -44,6 +44,7 @@ class Engine:
         self._strategy, self._pose_correction = self.agent.strategy, self.agent.pose_correction
         self._limits, self._num_frames = self.inbox.limits, 0
         self.sender_clocks = SenderClocks()
+        self.received_packets = self.received_bytes = 0
 
     @property
     def dropped(self) -> DropCounts:
@@ -52,6 +53,8 @@ class Engine:
 
     def push(self, received: ReceivedPacket) -> None:
         """Take one packet of the network."""
+        self.received_packets += 1
+        self.received_bytes += len(received.packet)
         self.inbox.push(received.packet, received.arrival_ns, received.origin)
 
     def share(self, frame: AgentFrame, level: int = 0, envelope: EnvelopeSize = UNSIGNED) -> list[bytes]:
@@ -65,8 +68,7 @@ class Engine:
         """Return boxes of the frame and of what was received by now_ns."""
         for arrival in self.inbox.arrivals():
             self.sender_clocks.record(arrival)
-        until_ns = self._unsynchronised_until_ns
-        if until_ns is not None and now_ns < until_ns:
+        if self.is_unsynchronised(now_ns):
             return self.agent.perceive(frame, (), now_ns)
         self._unsynchronised_until_ns = None
         skewed = self.sender_clocks.skewed(now_ns)
@@ -76,6 +78,10 @@ class Engine:
         perception = self.agent.perceive(frame, self.inbox, now_ns)
         rejected = [Rejection(agent_id, "skewed", _SKEWED) for agent_id in sorted(skewed)]
         return replace(perception, rejected=(*perception.rejected, *rejected)) if rejected else perception
+
+    def is_unsynchronised(self, now_ns: int) -> bool:
+        """Return whether the clock of the agent stepped shortly before a time."""
+        return self._unsynchronised_until_ns is not None and now_ns < self._unsynchronised_until_ns
 
     def step_clock(self, now_ns: int) -> None:
         """Begin anew after a step of the agent's clock: times of what was received are those of another clock."""

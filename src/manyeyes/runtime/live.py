@@ -57,7 +57,9 @@ class LiveTick:
     sent_bytes, sent_packets: with signatures. ages_ns: of each fused message, when the boxes were there. latency_ns: from the time
     of the frame to the boxes. share_ns, wait_ns, perceive_ns: its parts, besides the delay of the source. missed: beyond the
     deadline. level: of overload. skipped: frames of the source that were skipped so far. dropped, overflows: received packets so
-    far that were refused, or gave way before they were read. note: an event, such as a recording that stopped.
+    far that were refused, or gave way before they were read. note: an event, such as a recording that stopped. received_packets,
+    received_bytes: so far, refused ones too. unsynchronised: the clock stepped shortly before. clock_offset_ns: the median clock of
+    others less the own one, by two-way queries, 0 without any.
     """
 
     frame: AgentFrame
@@ -75,6 +77,10 @@ class LiveTick:
     dropped: DropCounts
     overflows: int
     note: str = ""
+    received_packets: int = 0
+    received_bytes: int = 0
+    unsynchronised: bool = False
+    clock_offset_ns: int = 0
 
 
 class _Shared(NamedTuple):
@@ -141,6 +147,10 @@ class _Loop:
             self.engine.dropped,
             getattr(self.network, "overflows", 0),
             note,
+            self.engine.received_packets,
+            self.engine.received_bytes,
+            self.engine.is_unsynchronised(now_ns),
+            self._clock_offset_ns(),
         )
 
     def _send(self, frame: AgentFrame, level: int, now_ns: int) -> tuple[AgentFrame, list[bytes]]:
@@ -197,6 +207,11 @@ class _Loop:
             self.recorder.add(ClockStep(now_ns, step_ns))
         return f"clock_step: {step_ns / 1e9:+.3f} s; nothing is fused for a second"
 
+    def _clock_offset_ns(self) -> int:
+        offsets = getattr(self.network, "clock_offsets", None)
+        found = [] if offsets is None else sorted(one.offset_ns for one in offsets().values())
+        return found[len(found) // 2] if found else 0
+
     def _reload_trust(self, now_ns: int) -> str:
         verifier = self.engine.verifier
         if self.watcher is None or verifier is None:
@@ -234,6 +249,11 @@ class LiveRun:
                 recorder.add(engine.verifier.trust)
         self.recorder = recorder
         self._source = NewestFrame(frames, clock)
+        self._network = network
+
+    def neighbours(self) -> frozenset[str]:
+        """Return the links of the network from which something arrived lately."""
+        return self._network.neighbours()
 
     def __iter__(self) -> Iterator[LiveTick]:
         try:

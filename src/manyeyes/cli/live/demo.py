@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 START_TIMEOUT_S, END_TIMEOUT_S = 600.0, 60.0
-FRAME_S, BUSY_FRACTION = 0.1, 0.6
-"""Duration of a frame, and the fraction of the cores that the processes may need for the clock to be that of the wall."""
+DEFAULT_MAP_WEIGHTS = "map-small-lidar"
 
 
 @dataclass(frozen=True)
@@ -51,6 +50,8 @@ class Options:
     """Signatures; keys are made for the run."""
     out: OutputFolder = Path("out/live")
     """Folder for keys, recordings and summaries."""
+    map: bool = False
+    """Agents send local maps, too, and a map server fuses them to one map, in the folder map of --out."""
     check: bool = True
     """Compute each recorded run again, and compare bit for bit."""
     seed: Seed = 0
@@ -72,6 +73,7 @@ def main(options: Options) -> None:
 def _run_team(options: Options, console: Console) -> None:
     from manyeyes.cli.live.replay import check_run
     from manyeyes.cli.live.table import load_summary, print_summaries
+    from manyeyes.datasets.frame_reader import as_frame_reader
     from manyeyes.datasets.registry import open_recording
     from manyeyes.datatypes import ConfigError
     from manyeyes.studies.replay_options import make_excerpt
@@ -85,19 +87,21 @@ def _run_team(options: Options, console: Console) -> None:
     agents = present[: options.agents]
     for old in options.out.glob("agent-*.*"):
         old.unlink()
-    commands = [
-        _make_command(
-            options, [str(root), *(["--split", split] if split else []), "--scenario", scenario], agent, number
-        )
-        for number, agent in enumerate(agents)
-    ]
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    drive = [str(root), *(["--split", split] if split else []), "--scenario", scenario]
+    commands = [_make_command(options, drive, agent, number) for number, agent in enumerate(agents)]
+    if options.map:
+        x, y, _ = as_frame_reader(recording).frame(scenario, 0, agents[0]).world_from_agent.translation.tolist()
+        commands.append(_make_map_command(options, (x, y)))
     _make_keys(options, agents)
-    rate = _run_processes(commands, options, console)
+    rate, text = _run_processes(commands, len(agents), options, load, console)
     files = [options.out / f"agent-{agent}.json" for agent in agents]
     print_summaries([load_summary(file) for file in files], console)
     reason = "as given" if options.rate else "that many agents do not fit on these cores"
     pace = "in real time" if rate == 1 else f"at {rate:.3g} of real time: {reason}"
     console.print(f"{len(agents)} processes, {options.transport}, security {options.security}, {pace}", soft_wrap=True)
+    if text:
+        console.print(f"map: {text}", highlight=False, markup=False, soft_wrap=True)
     for agent in agents if options.check else ():
         console.print(check_run(options.out / f"agent-{agent}.mcap"), highlight=False, markup=False, soft_wrap=True)
 
@@ -130,17 +134,45 @@ def _make_command(options: Options, drive: Sequence[str], agent: int, number: in
     """Return the command of one process; the first one listens, the others connect to it, or all share a port."""
     keys, method = options.out / "keys", options.method
     words = [sys.executable, "-m", "manyeyes.cli.main", "live", "run", *drive, "--agent", str(agent), "--await-start"]
-    words += ["--frames", str(options.frames), "--net", f"demo-{os.getpid()}", "--transport", options.transport]
+    words += ["--frames", str(options.frames)]
     words += ["--record", str(options.out / f"agent-{agent}.mcap"), "--out", str(options.out / f"agent-{agent}.json")]
     words += ["--weights", method.weights, "--method", method.method, "--budget-bytes", str(method.budget_bytes)]
     words += ["--pose-correction", method.pose_correction] if method.pose_correction else []
-    if options.security != "off":
-        words += ["--security", options.security, "--trust", str(keys / "trust.toml")]
-        words += ["--key", str(keys / f"agent-{agent}.key")]
+    words += ["--misbehaviour", method.misbehaviour] if method.misbehaviour else []
+    map_weights = method.map_weights or (DEFAULT_MAP_WEIGHTS if options.map else None)
+    words += ["--map-weights", map_weights, "--map-period-s", str(method.map_period_s)] if map_weights else []
+    words += _make_security_words(options)
+    words += ["--key", str(keys / f"agent-{agent}.key")] if options.security != "off" else []
+    return [*words, *_make_network_words(options, is_seed=number == 0)]
+
+
+def _make_map_command(options: Options, position_m: tuple[float, float]) -> list[str]:
+    """Return the command of the map server."""
+    words = [
+        sys.executable,
+        "-m",
+        "manyeyes.cli.main",
+        "live",
+        "map",
+        "--await-start",
+        "--out",
+        str(options.out / "map"),
+    ]
+    words += ["--position-m", *(f"{value:.1f}" for value in position_m)]
+    return [*words, *_make_security_words(options), *_make_network_words(options, is_seed=False)]
+
+
+def _make_security_words(options: Options) -> list[str]:
+    if options.security == "off":
+        return []
+    return ["--security", options.security, "--trust", str(options.out / "keys" / "trust.toml")]
+
+
+def _make_network_words(options: Options, is_seed: bool) -> list[str]:
+    words = ["--net", f"demo-{os.getpid()}", "--transport", options.transport]
     if options.transport == "udp":
         return [*words, "--port", str(_FREE_PORT.number)]
-    seed = f"tcp/127.0.0.1:{_FREE_PORT.number}"
-    return [*words, *(["--connect", seed] if number else ["--listen", seed])]
+    return [*words, "--listen" if is_seed else "--connect", f"tcp/127.0.0.1:{_FREE_PORT.number}"]
 
 
 class _FreePort:
@@ -162,8 +194,14 @@ class _FreePort:
 _FREE_PORT = _FreePort()
 
 
-def _run_processes(commands: Sequence[Sequence[str]], options: Options, console: Console) -> float:
-    """Start the processes together, and wait for their end; return the rate of their clock."""
+def _run_processes(
+    commands: Sequence[Sequence[str]], num_agents: int, options: Options, load: float, console: Console
+) -> tuple[float, str]:
+    """Start the processes together, wait for the end of the agents, and end the map server after them.
+
+    load: of the machine before. Returns the rate of their clock, and what the map server printed.
+    """
+    from manyeyes.cli.live.rate import FRAME_S, choose_rate
     from manyeyes.runtime.clock import read_tai_ns
 
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
@@ -174,23 +212,26 @@ def _run_processes(commands: Sequence[Sequence[str]], options: Options, console:
     try:
         with console.status("Starting the agents"):
             seconds = [_read_ready(process) for process in processes]
-        rate = options.rate or min(1.0, BUSY_FRACTION * (os.cpu_count() or 1) * FRAME_S / sum(seconds))
-        start_ns = read_tai_ns() + 1_000_000_000
+        rate = options.rate or choose_rate(seconds[:num_agents], os.cpu_count() or 1, load)
+        start_ns, text = read_tai_ns() + 1_000_000_000, ""
         for process in processes:
             assert process.stdin is not None
             process.stdin.write(f"{start_ns} {rate!r}\n")
             process.stdin.flush()
         with console.status(f"{len(processes)} agents on the network"):
-            for process in processes:
+            for process in processes[:num_agents]:
                 process.communicate(timeout=1.0 + options.frames * FRAME_S / rate * 3 + END_TIMEOUT_S)
-        return rate
+            for process in processes[num_agents:]:
+                process.terminate()
+                text = process.communicate(timeout=END_TIMEOUT_S)[0].strip()
+        return rate, text
     finally:
         _end(processes)
 
 
 def _read_ready(process: subprocess.Popen[str]) -> float:
     """Return the seconds of a frame that a process reports when it is ready."""
-    from manyeyes.cli.live.run import READY
+    from manyeyes.cli.live.start import READY
     from manyeyes.datatypes import ManyeyesError
 
     assert process.stdout is not None

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from manyeyes._bounds import ByteCount, InputPath, PortNumber
+from manyeyes._bounds import ByteCount, DurationS, InputPath, PortNumber
 
 if TYPE_CHECKING:
     from manyeyes.agents.agent import Agent
@@ -88,6 +88,10 @@ class MethodOptions:
     """The most that a message of tokens may weigh, with its signatures."""
     pose_correction: str | None = None
     """Correct the poses of senders before fusion, by this corrector."""
+    map_weights: str | None = None
+    """Send local maps of this map model, too, such as map-small-lidar; 'live map' fuses them."""
+    map_period_s: DurationS = 1.0
+    """Time from one local map to the next; predicting one takes longer than a frame."""
     misbehaviour: str | None = None
     """Weigh senders by trust: ray-evidence, a baseline (none, oracle, robosac, cp-guard), or a name of your own."""
 
@@ -100,7 +104,7 @@ class MethodOptions:
         from manyeyes.studies.provenance import installed_versions
 
         return RunConfig(
-            weights=str(Path(self.weights).resolve()) if Path(self.weights).is_file() else self.weights,
+            weights=_absolute(self.weights),
             fingerprint=fingerprint.hex(),
             strategy=self.method,
             budget_bytes=self.budget_bytes,
@@ -109,8 +113,14 @@ class MethodOptions:
             versions=installed_versions(),
             num_threads=torch.get_num_threads(),
             misbehaviour=self.misbehaviour,
+            map_weights=None if self.map_weights is None else _absolute(self.map_weights),
+            map_period_s=self.map_period_s,
             utc_offset_ns=-TAI_UTC_NS,
         )
+
+
+def _absolute(weights: str) -> str:
+    return str(Path(weights).resolve()) if Path(weights).is_file() else weights
 
 
 def make_agent(config: RunConfig) -> Agent:
@@ -120,6 +130,8 @@ def make_agent(config: RunConfig) -> Agent:
         CheckpointError: the weights of this name are others than those of the run.
     """
     from manyeyes.agents.agent import Agent
+    from manyeyes.agents.map_perception import MapModelPredictor
+    from manyeyes.agents.periodic_map import PeriodicMapPredictor
     from manyeyes.agents.pose_correction import PoseCorrection
     from manyeyes.agents.strategies.registry import get_strategy
     from manyeyes.agents.trust.registry import get_misbehaviour_detector
@@ -131,11 +143,16 @@ def make_agent(config: RunConfig) -> Agent:
         raise CheckpointError(
             f"Weights {config.weights} are {detector.fingerprint.hex()}; the run had {config.fingerprint}: use the same."
         )
+    map_predictor = None
+    if config.map_weights is not None:
+        map_model = pretrained.load_map_model(config.map_weights)
+        map_predictor = PeriodicMapPredictor(MapModelPredictor(map_model), round(config.map_period_s * 1e9))
     correction = None if config.pose_correction is None else PoseCorrection(config.pose_correction)
     return Agent(
         detector,
         get_strategy(config.strategy),
         budget_bytes=config.budget_bytes,
         pose_correction=correction,
+        map_predictor=map_predictor,
         misbehaviour=None if config.misbehaviour is None else get_misbehaviour_detector(config.misbehaviour),
     )

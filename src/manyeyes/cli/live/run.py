@@ -9,7 +9,7 @@ from __future__ import annotations
 import signal
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,17 +17,13 @@ import tyro
 
 from manyeyes._bounds import AgentId, DurationMs, OutputFile, PlaybackRate, PositiveInt, WorkerCount
 from manyeyes.cli.live.options import MethodOptions, NetworkOptions, SecurityOptions
-from manyeyes.datatypes.errors import ConfigError
 
 if TYPE_CHECKING:
-    from manyeyes.agents.agent import Agent
     from manyeyes.datatypes import AgentFrame
     from manyeyes.runtime.clock import LiveClock
     from manyeyes.runtime.live import LiveRun
+    from manyeyes.runtime.recorder import RunConfig
     from manyeyes.runtime.summary import RunSummary
-
-READY = "ready"
-START_DELAY_NS = 200_000_000
 
 
 @dataclass(frozen=True)
@@ -56,6 +52,10 @@ class Options:
     """Record the run to this file (.mcap): 'manyeyes live replay' computes it again."""
     out: OutputFile | None = None
     """Write the summary as JSON."""
+    metrics: str | None = None
+    """Serve /metrics (Prometheus) and /healthz at this address, such as 127.0.0.1:9464."""
+    json_log: bool = False
+    """Write events as JSON lines to the standard error."""
     await_start: bool = False
     """Print "ready" and the seconds of a frame, then read the time of the start (TAI, ns since 1970) and the rate."""
     network: NetworkOptions = field(default_factory=NetworkOptions)
@@ -88,14 +88,15 @@ def main(options: Options) -> None:
     deadlines = LiveConfig(round(options.perceive_after_ms * 1e6), round(options.deadline_ms * 1e6))
     agent = make_agent(config)
     first = next(play_recording(recording, scenario, options.agent, 0, 1))
-    clock = _wait_for_start(options, agent, first)
+    clock = _wait_for_start(options, config, first)
     frames = play_recording(recording, scenario, options.agent, clock.start_ns, options.frames)
     network = options.network.open(options.agent, clock.now_ns)
     try:
         x, y, _ = first.world_from_agent.translation.tolist()
         network.join((x, y))
         recorder = None if options.record is None else Recorder(options.record, config)
-        summary = _collect(LiveRun(frames, agent, network, clock, deadlines, security, recorder), options.agent, clock)
+        run = LiveRun(frames, agent, network, clock, deadlines, security, recorder)
+        summary = _collect(run, options, clock)
     finally:
         network.close()
     if options.out is not None:
@@ -103,31 +104,24 @@ def main(options: Options) -> None:
     print_summaries((summary,), Console())
 
 
-def _wait_for_start(options: Options, agent: Agent, first: AgentFrame) -> LiveClock:
+def _wait_for_start(options: Options, config: RunConfig, first: AgentFrame) -> LiveClock:
     """Warm up with the first frame, and return the clock, whose start is when the others start too."""
-    from manyeyes.agents.agent import Agent
-    from manyeyes.runtime.clock import LiveClock, read_tai_ns
+    from manyeyes.cli.live.options import make_agent
+    from manyeyes.cli.live.start import announce_ready
 
-    took = 0.0
-    # The first of two frames compiles and allocates.
-    for _ in range(2):
-        began = time.perf_counter()
-        probe = Agent(agent.perception_cache.detector, agent.strategy, budget_bytes=agent.budget_bytes)
-        probe.perceive(first, probe.share(first))
-        took = time.perf_counter() - began
-    if not options.await_start:
-        return LiveClock(read_tai_ns() + START_DELAY_NS, options.rate)
-    sys.stdout.write(f"{READY} {took:.4f}\n")
-    sys.stdout.flush()
-    words = sys.stdin.readline().split()
-    if len(words) != 2:
-        raise ConfigError("--await-start reads the time of the start and the rate from the input; the input ended.")
-    start_ns, rate = words
-    return LiveClock(int(start_ns), float(rate))
+    took, probe = 0.0, make_agent(config)
+    # The first frames compile and allocate; in each, a local map is due.
+    for number in range(3):
+        frame = replace(first, timestamp_ns=first.timestamp_ns + number * 100 * 10**9)
+        began = time.process_time()
+        probe.perceive(frame, probe.share(frame))
+        took = time.process_time() - began
+    return announce_ready(options.await_start, took, options.rate)
 
 
-def _collect(run: LiveRun, agent_id: int, clock: LiveClock) -> RunSummary:
+def _collect(run: LiveRun, options: Options, clock: LiveClock) -> RunSummary:
     """Run to the end; a signal ends it after the current frame, a second one at once."""
+    from manyeyes.runtime.observers import Observers
     from manyeyes.runtime.summary import RunStatistics
 
     def stop(number: int, _: object) -> None:
@@ -136,9 +130,11 @@ def _collect(run: LiveRun, agent_id: int, clock: LiveClock) -> RunSummary:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
-    statistics, recorder = RunStatistics(agent_id, clock.rate), run.recorder
-    for tick in run:
-        statistics.add(tick)
+    statistics, recorder = RunStatistics(options.agent, clock.rate), run.recorder
+    with Observers.open(options.agent, clock, options.metrics, sys.stderr if options.json_log else None) as observers:
+        for tick in run:
+            statistics.add(tick)
+            observers.add(tick, run.neighbours())
     if recorder is None:
         return statistics.summary()
     note = recorder.close()

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is logged for the viewer is read back from its file: entities, timelines, places, colours and labels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("rerun", reason="the extra rerun is not installed")
+
+import rerun
+
+from manyeyes.datatypes import Boxes, ConfigError, Transform
+from manyeyes.viz.rerun_log import MAX_POINTS, RerunLog
+from manyeyes.viz.spatial_frame import (
+    BOX_COLORS,
+    ShownAgent,
+    ShownBoxes,
+    ShownLink,
+    SpatialFrame,
+    mark_errors,
+)
+
+START_NS = 1_800_000_000 * 10**9
+
+
+def box(x: float, score: float = 0.9, number: int = -1) -> Boxes:
+    return Boxes.of(
+        torch.tensor([[x, 0.0, 0.8]]), torch.tensor([[4.0, 2.0, 1.6]]), torch.tensor([np.pi / 2]), torch.tensor([score]),
+        id=torch.tensor([number]),
+    )  # fmt: skip
+
+
+def make_frame(index: int = 0) -> SpatialFrame:
+    cloud = np.arange(12, dtype=np.float32).reshape(4, 3)
+    here, there = Transform.from_xyz_yaw(1.0, 2.0, 0.0), Transform.from_xyz_yaw(11.0, 2.0, 0.0, np.pi / 2)
+    return SpatialFrame(
+        index,
+        START_NS + index * 10**8,
+        (
+            ShownAgent(1, here, cloud, np.array([0.0, 0.5, 1.0, 2.0], np.float32)),
+            ShownAgent(2, there, corrected=Transform.from_xyz_yaw(12.0, 3.0, 0.0)),
+        ),
+        ShownBoxes(Boxes.cat([box(5.0), box(30.0, 0.4)]), ("matched", "false")),
+        ShownBoxes(Boxes.cat([box(5.0, 1.0, 7), box(60.0, 1.0, 8)]), ("truth", "missed")),
+        (ShownLink(2, 1, 1_500, 80.0, START_NS + 5), ShownLink(9, 1, 10, 80.0)),
+        {"divider": (np.array([[0.0, 0.0], [5.0, 1.0]]),)},
+        {"age_ms/2": 80.0},
+        ("agent 2 rejected: skewed",),
+    )
+
+
+def read_back(path: Path) -> dict[str, list]:
+    """Chunks by entity."""
+    found: dict[str, list] = {}
+    for chunk in rerun.chunk.RrdReader(str(path)).stream():
+        found.setdefault(chunk.entity_path, []).append(chunk)
+    return found
+
+
+def column(chunks: list, name: str) -> list:
+    values = []
+    for chunk in chunks:
+        batch = chunk.to_record_batch()
+        if name in batch.schema.names:
+            values += batch.column(name).to_pylist()
+    return values
+
+
+def test_what_was_logged_is_read_back(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "drive.rrd"
+    with RerunLog(str(path)) as log:
+        for index in range(3):
+            log.add(make_frame(index))
+        assert not path.exists()
+    assert [p.name for p in path.parent.iterdir()] == ["drive.rrd"]
+    found = read_back(path)
+    assert {
+        "/world/agents/1", "/world/agents/1/cloud", "/world/agents/2", "/world/corrections/2", "/world/ego/boxes", "/world/truth",
+        "/world/links/2-1", "/world/map/divider", "/plots/age_ms/2", "/events",
+    } <= found.keys()  # fmt: skip
+    # No pose of agent 9 is known.
+    assert not {"/world/links/9-1", "/world/agents/2/cloud", "/world/corrections/1"} & found.keys()
+    assert sorted(column(found["/world/ego/boxes"], "tick")) == [0, 1, 2]
+    timelines = {name for chunk in found["/world/links/2-1"] for name in chunk.timeline_names}
+    assert {"tick", "capture", "arrival"} <= timelines
+    assert "arrival" not in {name for chunk in found["/world/truth"] for name in chunk.timeline_names}
+    captured = np.array(column(found["/world/agents/1"], "capture"), "datetime64[ns]").astype(np.int64)
+    assert sorted(captured.tolist()) == [START_NS + k * 10**8 for k in range(3)]
+    boxes = found["/world/ego/boxes"]
+    assert column(boxes, "Boxes3D:labels")[0] == ["0.90 matched", "0.40 false"]
+    assert np.allclose(column(boxes, "Boxes3D:centers")[0], [[5.0, 0.0, 0.8], [30.0, 0.0, 0.8]])
+    assert np.allclose(column(boxes, "Boxes3D:quaternions")[0], [[0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]] * 2, atol=1e-6)
+    r, g, b = BOX_COLORS["matched"]
+    assert column(boxes, "Boxes3D:colors")[0][0] == (r << 24) + (g << 16) + (b << 8) + 255
+    assert column(found["/world/truth"], "Boxes3D:labels")[0] == ["7 1.00 truth", "8 1.00 missed"]
+    assert column(found["/world/agents/1/cloud"], "Points3D:positions")[0][3] == [9.0, 10.0, 11.0]
+    assert column(found["/world/corrections/2"], "Arrows3D:vectors")[0] == [[1.0, 1.0, 0.0]]
+    assert column(found["/world/links/2-1"], "LineStrips3D:labels")[0] == ["1500 B, 80 ms"]
+    assert column(found["/plots/age_ms/2"], "Scalars:scalars")[0] == [80.0]
+    assert column(found["/events"], "TextLog:text")[0] == ["agent 2 rejected: skewed"]
+
+
+def test_long_clouds_are_thinned_and_a_failed_log_leaves_no_file(tmp_path: Path) -> None:
+    path = tmp_path / "a.rrd"
+    cloud = np.zeros((2 * MAX_POINTS + 1, 3), np.float32)
+    nothing = ShownBoxes(Boxes.empty(), ())
+    with RerunLog(str(path)) as log:
+        log.add(SpatialFrame(0, START_NS, (ShownAgent(1, Transform.identity(), cloud),), nothing, nothing))
+    (points,) = column(read_back(path)["/world/agents/1/cloud"], "Points3D:positions")
+    assert MAX_POINTS / 2 < len(points) <= MAX_POINTS
+    with pytest.raises(ZeroDivisionError), RerunLog(str(tmp_path / "b.rrd")):
+        raise ZeroDivisionError
+    assert [p.name for p in tmp_path.iterdir()] == ["a.rrd"]
+    with pytest.raises(ConfigError, match=r"\.rrd"):
+        RerunLog("drive.png")
+
+
+def test_each_true_box_is_matched_once_and_the_others_are_errors() -> None:
+    """Boxes at 5 m (twice), 20 m and truth at 5 m and 40 m: one match, two false, one missed."""
+    boxes = Boxes.cat([box(5.1, 0.5), box(5.0, 0.9), box(20.0, 0.8)])
+    assert mark_errors(boxes, Boxes.cat([box(5.0), box(40.0)])) == (("false", "matched", "false"), ("truth", "missed"))
+    assert mark_errors(Boxes.empty(), box(5.0)) == ((), ("missed",))
+    assert mark_errors(box(5.0), Boxes.empty()) == (("false",), ())
