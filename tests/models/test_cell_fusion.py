@@ -8,6 +8,7 @@ import torch
 from tests.models.fusion_cases import CHANNELS, CONFIG, draw_agent, tokens_of
 
 from manyeyes.datatypes import ConfigError, Sites, SparseBev, Transform
+from manyeyes.models.detector.box_head import BOX_LAYOUT
 from manyeyes.models.detector.codebook import CodebookConfig
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
@@ -124,18 +125,22 @@ def test_a_bare_fusion_needs_no_proposal(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", BARE)
-def test_a_bare_detector_sends_features_and_confidence_at_most(name: str) -> None:
+def test_a_bare_detector_sends_features_and_what_its_rule_needs_of_proposals(name: str) -> None:
     torch.manual_seed(0)
     detector = Detector(dataclasses.replace(COSTR_TINY, fusion=name)).eval()
     channels = detector.encoder.out_channels
-    assert detector.refine is None and detector.packed_channels in (channels, channels + 1)
+    assert detector.refine is None and detector.packed_channels in (channels, channels + 1, channels + 3)
     grid = detector.token_grid
     tokens = SparseBev(torch.randn(5, detector.token_channels), Sites(torch.arange(5), grid))
     packed = detector.pack_tokens(tokens)
     assert packed.features.shape == (5, detector.packed_channels)
     received = detector.unpack_tokens(packed)
     assert received.features.shape == tokens.features.shape
-    assert torch.equal(received.features[:, : detector.packed_channels], packed.features)
+    assert torch.equal(received.features[:, :channels], packed.features[:, :channels])
+    assert torch.equal(detector.pack_tokens(received).features, packed.features)
+    velocity = received.features[:, channels:][:, BOX_LAYOUT.velocity].any()
+    assert bool(velocity) == (name == "how2comm/bare")
+    received.features[:, channels:][:, BOX_LAYOUT.velocity] = 0
     assert not received.features[:, channels + 1 :].any()
     fused, raw = detector.fuse(to_ego_frame([AgentTokens(0, tokens.features, tokens.sites.xy)], grid, 1))
     assert torch.equal(raw.to_rows(), detector.head(fused.bev).to_rows())

@@ -37,7 +37,8 @@ def test_an_ego_that_is_sure_everywhere_uses_common_features_alone() -> None:
 
 
 def test_the_loss_reaches_the_weights_of_the_gate_and_an_open_gate_changes_nothing() -> None:
-    model, rows = built(How2comm).requires_grad_(True), some_rows()
+    """In training; outside of it senders have cut what arrives."""
+    model, rows = built(How2comm).requires_grad_(True).train(), some_rows()
     model(rows).square().sum().backward()
     assert all(bool(p.grad.abs().sum() > 0) for p in model.spatial.parameters())
     with torch.no_grad():
@@ -46,6 +47,7 @@ def test_the_loss_reaches_the_weights_of_the_gate_and_an_open_gate_changes_nothi
         assert torch.allclose(model(rows), fused, atol=1e-6)
         model.spatial.combine.bias.fill_(-50.0)
         assert torch.equal(model(rows), rows.own_features())
+        assert torch.allclose(model.eval()(rows), fused, atol=1e-6)
 
 
 def test_one_agent_is_returned_as_it_is() -> None:

@@ -201,7 +201,7 @@ class Agent:
         if message is not None and self.pose_correction is not None:
             message = self.pose_correction.attach_descriptors(frame, self.perception_cache, message)
         sends_request_map = self.send_request_map or getattr(self.strategy, "needs_request_map", False)
-        if message is not None and message.tokens is not None and sends_request_map:
+        if message is not None and message.tokens is not None and sends_request_map and message.request is None:
             message = replace(message, request=make_request_map(self.perception_cache, frame))
         return message
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from manyeyes._bounds import ChannelCount, FiniteFloat
 from manyeyes.datatypes import VEHICLES, BevGrid, Boxes, ConfigError, PointCloud, SparseBev
-from manyeyes.models.detector.box_head import BoxHead, DecodeConfig, RawBoxes, RefineHead, decode
+from manyeyes.models.detector.box_head import BOX_LAYOUT, BoxHead, DecodeConfig, RawBoxes, RefineHead, decode
 from manyeyes.models.detector.cluster_rows import count_own_bytes, decode_cluster_rows, encode_cluster_rows
 from manyeyes.models.detector.codebook import Codebook, CodebookConfig
 from manyeyes.models.detector.encoder import EncoderConfig, SparseEncoder
@@ -20,12 +20,15 @@ from manyeyes.models.detector.proposal import NO_HEAT_LOGIT, PROPOSAL_DIM, make_
 from manyeyes.models.detector.pruning import FocalPrune, PruneOutput
 from manyeyes.models.detector.selector import Selector
 from manyeyes.models.detector.transformer import AttentionConfig, WindowTransformer
+from manyeyes.models.fusion.by_cell import CellRows
 from manyeyes.models.fusion.clusters import ClusterCompression
+from manyeyes.models.fusion.how2comm import How2comm, SpatialGate
 from manyeyes.models.fusion.registry import get_fusion
 from manyeyes.models.fusion.token_merge import FusedBev
-from manyeyes.models.fusion.transform_tokens import Tokens
+from manyeyes.models.fusion.transform_tokens import AgentTokens, Tokens, to_ego_frame
 from manyeyes.models.score_calibration import ScoreCalibration
 from manyeyes.ops.lidar.sweep_statistics import SensorDomain
+from manyeyes.ops.voxelize import segment_max
 
 
 @dataclass(frozen=True)
@@ -118,12 +121,15 @@ class Detector(nn.Module):
 
     @property
     def packed_channels(self) -> int:
-        """Number of columns of a token that is sent: of a bare fusion features, and the confidence if it needs one."""
-        return self.encoder.out_channels + self._sends_confidence if self.is_bare else self.token_channels
+        """Number of columns of a token that is sent: of a bare fusion features, and what it needs of the proposal."""
+        return self.encoder.out_channels + len(self._sent_proposal) if self.is_bare else self.token_channels
 
     @property
-    def _sends_confidence(self) -> bool:
-        return bool(getattr(self.fusion, "sends_confidence", False))
+    def _sent_proposal(self) -> list[int]:
+        """Columns of the proposal that a bare fusion sends: the confidence, and the velocity, if it needs them."""
+        spans = {"sends_confidence": BOX_LAYOUT.heatmap_logit, "sends_velocity": BOX_LAYOUT.velocity}
+        needed = [span for name, span in spans.items() if getattr(self.fusion, name, False)]
+        return [column for span in needed for column in range(span.start, span.stop)]
 
     @property
     def decode_config(self) -> DecodeConfig:
@@ -173,15 +179,45 @@ class Detector(nn.Module):
         """Return the columns of shared tokens that are sent (N, packed_channels)."""
         if not self.is_bare:
             return tokens
-        return tokens.with_features(tokens.features[:, : self.packed_channels])
+        channels = self.encoder.out_channels
+        columns = [*range(channels), *(channels + column for column in self._sent_proposal)]
+        return tokens.with_features(tokens.features[:, columns])
 
     def unpack_tokens(self, tokens: SparseBev) -> SparseBev:
         """Return received tokens (N, packed_channels) as (N, token_channels); proposals that were not sent are neutral."""
         if not self.is_bare:
             return tokens
         channels, rows = self.encoder.out_channels, tokens.features
-        heat = rows[:, channels] if self._sends_confidence else rows.new_full((len(rows),), NO_HEAT_LOGIT)
-        return tokens.with_features(torch.cat((rows[:, :channels], make_bare_proposals(heat)), 1))
+        proposals = make_bare_proposals(rows.new_full((len(rows),), NO_HEAT_LOGIT))
+        proposals[:, self._sent_proposal] = rows[:, channels:]
+        return tokens.with_features(torch.cat((rows[:, :channels], proposals), 1))
+
+    @property
+    def has_gate(self) -> bool:
+        """Whether the fusion has a gate that acts at the sender (How2comm)."""
+        return isinstance(getattr(self.fusion, "rule", None), How2comm)
+
+    def attend_tokens(self, tokens: SparseBev) -> Tensor:
+        """Return the spatial attention (N,) in [0, 1] of an agent to its shared tokens, by a fusion that has_gate."""
+        rows, row, spatial = self._gate(tokens)
+        return spatial.attend(rows)[row, 0].to(tokens.features.device)
+
+    def gate_tokens(self, tokens: SparseBev, request: Tensor) -> Tensor:
+        """Return the gates (N,) in [0, 1] of an agent's shared tokens, by a fusion that has_gate.
+
+        request: (N,) in [0, 1], 1 - attention of the receiver that requests most.
+        """
+        rows, row, spatial = self._gate(tokens)
+        largest = segment_max(request.to(rows.features)[:, None], row, len(rows.cell))
+        return spatial.open(rows, largest, spatial.attend(rows))[row, 0].to(tokens.features.device)
+
+    def _gate(self, tokens: SparseBev) -> tuple[CellRows, Tensor, SpatialGate]:
+        """Return the rows of an agent's own tokens as its fusion takes them, the row (N,) of each token, and the gate."""
+        rule = getattr(self.fusion, "rule", None)
+        if not isinstance(rule, How2comm):
+            raise ConfigError(f"fusion {self.config.fusion} has no gate at the sender; how2comm has one.")
+        own = to_ego_frame([AgentTokens(0, tokens.features, tokens.sites.xy)], tokens.grid, 1)
+        return *self.fusion.gather(own.to(self.device)), rule.spatial
 
     @property
     def cluster_form(self) -> tuple[int, int] | None:

@@ -3,8 +3,9 @@
 
 inside: the rule replaces the feature merge alone; tokens lie on the cells that they propose, with proposals, velocities, history,
 encoding and merged boxes as for every other fusion. It is registered under its name, and absent senders are masked.
-bare: features alone are sent; a token stays on the cell where it lies, there is no velocity and no history, and boxes come from the
-single-agent head on the fused features. It is registered as ``NAME/bare``; an absent sender is a row of zeros, as in the papers.
+bare: features alone are sent; a token stays on the cell where it lies, there is no history, and no velocity but of a method that
+compensates delays; boxes come from the single-agent head on the fused features. It is registered as ``NAME/bare``; an absent sender
+is a row of zeros, as in the papers.
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
-from torch import nn
+from torch import Tensor, nn
 
 from manyeyes.datatypes import SparseBev
 from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.detector.transformer import AttentionConfig
-from manyeyes.models.fusion.by_cell import AbsentSenders, gather_by_cell, standing_cells
+from manyeyes.models.fusion.by_cell import AbsentSenders, CellRows, gather_by_cell, standing_cells
 from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
 from manyeyes.models.fusion.registry import register_fusion
 from manyeyes.models.fusion.token_merge import FusedBev, TokenMerge, assign_cells
@@ -48,6 +49,11 @@ class RuleFusion(nn.Module):
         merged = self.merge.merge_proposals(features, tokens, key, place)
         return merged.with_features(self.rule(gather_by_cell(features, tokens, key)[0]))
 
+    def gather(self, tokens: Tokens) -> tuple[CellRows, Tensor]:
+        """Return the rows that the rule takes of tokens, and the row (N,) of each token."""
+        key, place = assign_cells(tokens)
+        return gather_by_cell(self.encoding(tokens.features, tokens, place), tokens, key)
+
 
 class BareFusion(nn.Module):
     """Mode bare: the rule alone.
@@ -55,13 +61,17 @@ class BareFusion(nn.Module):
     Attributes:
         is_bare: the detector sends features alone, and decodes boxes from the fused features.
         sends_confidence: the rule needs the confidence of the senders; it is one more column of a token.
+        sends_velocity: the rule moves delayed rows by velocities of the senders, which are two more columns.
     """
 
     is_bare = True
 
     def __init__(self, rule: nn.Module) -> None:
         super().__init__()
-        self.rule, self.sends_confidence = rule, bool(getattr(rule, "sends_confidence", False))
+        self.rule = rule
+        self.sends_confidence, self.sends_velocity = (
+            bool(getattr(rule, name, False)) for name in ("sends_confidence", "sends_velocity")
+        )
 
     @property
     def compression(self) -> nn.Module | None:
@@ -70,9 +80,13 @@ class BareFusion(nn.Module):
 
     def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
         """Fuse the tokens of all agents to one feature per cell; past is ignored, and merged proposals are zero."""
-        rows, _ = gather_by_cell(tokens.features, tokens, standing_cells(tokens))
+        rows, _ = self.gather(tokens)
         fused = self.rule(rows)
         return FusedBev(SparseBev(fused, rows.sites), fused.new_zeros(len(rows.sites), PROPOSAL_DIM))
+
+    def gather(self, tokens: Tokens) -> tuple[CellRows, Tensor]:
+        """Return the rows that the rule takes of tokens, and the row (N,) of each token."""
+        return gather_by_cell(tokens.features, tokens, standing_cells(tokens))
 
 
 def register_bare(name: str) -> Callable[[Rule], Rule]:

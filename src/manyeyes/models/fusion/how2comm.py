@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """How2comm (Yang et al., NeurIPS 2023): spatial gates of what is requested, and exclusive and common features fused apart.
 
-A row of a collaborator is cut where the gate of the ego's request and of its own attention is closed; the cut is
-straight-through, so that the loss trains the gate. Here the gate acts at the receiver; bytes are saved by the selections of
-strategies. Attention to deformable points is attention to the nearest rows within two cells. Of the paper's compensation of delays
-the velocities of the senders remain, in mode inside; channel masks, history of the ego and the loss on mutual information are not
-part of it.
+A row of a collaborator is cut where the gate of the ego's request and of its own attention is closed. The sender cuts, by the
+strategy ``intermediate-how2comm``; in training the same gate cuts what arrives, straight-through, so that the loss trains it, with
+the ego's request of the same instant and of each cell. Attention to deformable points is attention to the nearest rows within two
+cells. Instead of a flow that the receiver estimates, the sender states the velocity of each row, in mode bare too. Channel masks,
+history of the ego and the loss on mutual information are not part of it.
 """
 
 from __future__ import annotations
@@ -21,31 +21,55 @@ from manyeyes.models.fusion._layers import PlainConv
 from manyeyes.models.fusion.by_cell import AbsentSenders, CellRows
 from manyeyes.models.fusion.cell_fusion import register_rule
 from manyeyes.ops.nearest_rows import nearest_rows
+from manyeyes.ops.sparse_conv import submanifold_conv
 
 MIN_SHARE = 0.01
 """Gates and shares of confidence below this one are closed."""
 NUM_EXCLUSIVE, NUM_COMMON = 9, 3
 """Nearest rows that a cell attends to."""
 REACH_CELLS = 2.0
+GAUSSIAN_CELLS = 5
 
 
 class SpatialGate(nn.Module):
-    """S = sigmoid(w [1 - A_0 ; A_j]) of each row, with the spatial attention A = sigmoid(conv3x3([mean_C ; max_C])) of a map.
+    """S = smooth(sigmoid(w [1 - A_0 ; A_j])) smooth(sigmoid(mean_C x_j)) of each row.
 
-    A cell that the ego does not see is requested whole: A_0 = 0.
+    A = sigmoid(conv3x3([mean_C ; max_C])) is the spatial attention of a map; a cell that the ego does not see is requested whole:
+    A_0 = 0. Values are smoothed by a Gaussian over the occupied ones of 5 x 5 cells of a map.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self.attention, self.combine = PlainConv(2, 1), nn.Linear(2, 1)
 
-    def forward(self, rows: CellRows) -> Tensor:
-        """Return the gates (M, 1) in [0, 1]."""
+    def attend(self, rows: CellRows) -> Tensor:
+        """Return the spatial attention (M, 1) of the map of each sender."""
         maps = rows.to_maps()
         summary = torch.stack((maps.features.mean(1), maps.features.amax(1)), 1)
-        attention = maps.to_rows(torch.sigmoid(self.attention(SparseBev(summary, maps.sites))))
-        request = 1 - rows.own_features(attention)[rows.cell]
-        return torch.sigmoid(self.combine(torch.cat((request, attention), 1)))
+        return maps.to_rows(torch.sigmoid(self.attention(SparseBev(summary, maps.sites))))
+
+    def open(self, rows: CellRows, request: Tensor, attention: Tensor) -> Tensor:
+        """Return the gates (M, 1) in [0, 1] of requests 1 - A_0 (M, 1) and the senders' own attention (M, 1)."""
+        gate = torch.sigmoid(self.combine(torch.cat((request, attention), 1)))
+        maps = rows.to_maps()
+        both = torch.cat((gate[maps.row], torch.sigmoid(maps.features.mean(1, keepdim=True))), 1)
+        smoothed = _smooth(SparseBev(both, maps.sites))
+        return maps.to_rows(smoothed[:, :1] * smoothed[:, 1:])
+
+    def forward(self, rows: CellRows) -> Tensor:
+        """Return the gates (M, 1) of the rows, requested by the ego among them."""
+        attention = self.attend(rows)
+        return self.open(rows, 1 - rows.own_features(attention)[rows.cell], attention)
+
+
+def _smooth(x: SparseBev) -> Tensor:
+    """Return each column of (N, D) smoothed over the occupied ones of 5 x 5 cells by a Gaussian of one cell."""
+    at = torch.arange(GAUSSIAN_CELLS, device=x.features.device, dtype=x.features.dtype) - GAUSSIAN_CELLS // 2
+    line = torch.exp(-0.5 * at**2)
+    kernel = (line[:, None] * line / line.sum() ** 2)[None, None]
+    columns = [*x.features.unbind(1), torch.ones_like(x.features[:, 0])]
+    *sums, total = (submanifold_conv(x.with_features(column[:, None]), kernel).features for column in columns)
+    return torch.cat(sums, 1) / total
 
 
 class NearestAttention(nn.Module):
@@ -85,10 +109,11 @@ class NearestAttention(nn.Module):
 class How2comm(nn.Module):
     """y = x_0 + g_e attend(exclusive) + g_k attend(common) of each cell, with gates g of two convolutions and a softmax.
 
-    Of confidence c_j of a collaborator and c_0 of the ego on a cell, (1 - c_0) c_j is exclusive and c_0 c_j common.
+    Of confidence c_j of a collaborator and c_0 of the ego on a cell, (1 - c_0) c_j is exclusive and c_0 c_j common. Outside of
+    training all rows pass: their senders have cut them.
     """
 
-    sends_confidence = True
+    sends_confidence = sends_velocity = True
 
     def __init__(self, channels: int, attention: AttentionConfig, absent: AbsentSenders) -> None:
         super().__init__()
@@ -99,9 +124,11 @@ class How2comm(nn.Module):
 
     def forward(self, rows: CellRows) -> Tensor:
         """Fuse the rows to features (U, C) of the cells; absent senders have no rows in either mode."""
-        own, gate = rows.own_features(), self.spatial(rows)
-        # Straight-through: a hard cut in the value, the gate in the gradient.
-        passed = (gate > MIN_SHARE).to(gate.dtype) + gate - gate.detach()
+        own, passed = rows.own_features(), rows.features.new_ones(len(rows.cell), 1)
+        if self.training:
+            # Straight-through: a hard cut in the value, the gate in the gradient.
+            gate = self.spatial(rows)
+            passed = (gate > MIN_SHARE).to(gate.dtype) + gate - gate.detach()
         exclusive, common = split_confidence(rows)
         fused = [
             attend(own, rows, (rows.features * passed * share[:, None])[kept], kept)
