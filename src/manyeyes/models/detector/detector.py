@@ -21,6 +21,7 @@ from manyeyes.models.detector.pruning import FocalPrune, PruneOutput
 from manyeyes.models.detector.selector import Selector
 from manyeyes.models.detector.transformer import AttentionConfig, WindowTransformer
 from manyeyes.models.fusion.by_cell import CellRows
+from manyeyes.models.fusion.cell_fusion import BareFusion, RuleFusion
 from manyeyes.models.fusion.clusters import ClusterCompression
 from manyeyes.models.fusion.how2comm import How2comm, SpatialGate
 from manyeyes.models.fusion.registry import get_fusion
@@ -213,11 +214,11 @@ class Detector(nn.Module):
 
     def _gate(self, tokens: SparseBev) -> tuple[CellRows, Tensor, SpatialGate]:
         """Return the rows of an agent's own tokens as its fusion takes them, the row (N,) of each token, and the gate."""
-        rule = getattr(self.fusion, "rule", None)
-        if not isinstance(rule, How2comm):
+        fusion, rule = self.fusion, getattr(self.fusion, "rule", None)
+        if not (isinstance(fusion, RuleFusion | BareFusion) and isinstance(rule, How2comm)):
             raise ConfigError(f"fusion {self.config.fusion} has no gate at the sender; how2comm has one.")
         own = to_ego_frame([AgentTokens(0, tokens.features, tokens.sites.xy)], tokens.grid, 1)
-        return *self.fusion.gather(own.to(self.device)), rule.spatial
+        return *fusion.gather(own.to(self.device)), rule.spatial
 
     @property
     def cluster_form(self) -> tuple[int, int] | None:

@@ -34,8 +34,9 @@ INSIDE_FUSIONS = (
     "instances",
     "self-attention",
     "multi-scale",
+    "shift/fast",
 )
-"""Fusions in mode inside; instances is our own arm, the merge by distance."""
+"""Fusions in mode inside; our own arms are instances, the merge by distance, and shift/fast, FAST on aligned senders."""
 BARE_FUSIONS = ("max", "attfuse", "v2vnet", "v2x-vit", "where2comm", "disconet", "sparsealign", "how2comm", "ermvp")
 """Fusions in mode bare: features alone are sent."""
 STAGE_C_FUSIONS = INSIDE_FUSIONS
