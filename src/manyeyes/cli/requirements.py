@@ -147,6 +147,8 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
     "study shared-bandwidth": (_MATPLOTLIB,),
     "study num-agents": (_MATPLOTLIB,),
     "study sensors": (_MATPLOTLIB,),
+    "study attacks": (_MATPLOTLIB,),
+    "study false-accusations": (_SUMO,),
     "study strata": (),
     "study ablation": (_MATPLOTLIB,),
     "study qualitative": (_PILLOW,),

@@ -44,6 +44,12 @@ STUDIES = {
     "sensors": Study(
         _DETECTION, "intensity laws, one or two sweeps, and tilt, on recordings of the same scenes",
         "detection.sensors", "SensorsOptions"),
+    "attacks": Study(
+        _DETECTION, "attacks of malicious agents, without and with misbehaviour detection",
+        "attacks.study", "AttacksOptions"),
+    "false-accusations": Study(
+        _DETECTION, "honest senders named malicious, on long simulated drives, also through glass and in rain",
+        "attacks.false_accusations", "FalseAccusationsOptions"),
     "strata": Study(
         _DETECTION, "AP of each split of a data set, such as the sealed one", "detection.strata", "StrataOptions"),
     "num-agents": Study(_DETECTION, "one agent to five", "detection.num_agents", "EvaluationOptions"),

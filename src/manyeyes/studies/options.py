@@ -8,7 +8,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from manyeyes._bounds import AngleDeg, ByteCount, OutputFolder, PositiveInt, Seed, TrialCount, WorkerCount
+from manyeyes._bounds import (
+    AngleDeg,
+    ByteCount,
+    DurationS,
+    LengthM,
+    OutputFolder,
+    PositiveInt,
+    Seed,
+    TrialCount,
+    WorkerCount,
+)
 from manyeyes.studies.pose_error_options import PoseErrorOptions
 from manyeyes.studies.replay_options import BOTH_FORMS, FileChecks, ReplayOptions
 
@@ -120,6 +130,62 @@ class StrataOptions(EvaluationOptions):
 
     strata: tuple[str, ...] = ()
     """Splits of the data set, which are reported apart; by default all folders with scenarios."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttacksOptions(EvaluationOptions):
+    """Options of the study attacks."""
+
+    replay_options: ReplayOptions = field(
+        default_factory=lambda: ReplayOptions(
+            methods=("late", "late-temporal", "intermediate", "intermediate-temporal"),
+            channel="its-g5-6",
+            budget_bytes=4096,
+        )
+    )
+    """How agents collaborate."""
+    attacks: tuple[str, ...] = ()
+    """Attacks by name, the first one also with the other numbers of malicious agents; by default all."""
+    defences: tuple[str, ...] = ("ray-evidence",)
+    """Misbehaviour detectors by name, beside none and an oracle."""
+    counts: tuple[TrialCount, ...] = (1, 2)
+    """Numbers of malicious agents of the first attack; all others have their own."""
+    egos: PositiveInt = 1
+    """How many agents of a scenario are the ego in turn, with malicious agents around it."""
+    scenario_stride: PositiveInt = 1
+    """Only every n-th scenario."""
+    position_sigma_m: LengthM = 0.4
+    """Standard deviation of the prior positions of senders, metres."""
+    heading_sigma_deg: AngleDeg = 0.4
+    """Standard deviation of the prior headings of senders, degrees."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FalseAccusationsOptions(StudyOptions):
+    """Options of the study false-accusations."""
+
+    weights: str = "costr-small"
+    """Shipped weights by name, or a .safetensors file."""
+    method: str = "late"
+    """Strategy of all agents."""
+    defences: tuple[str, ...] = ("ray-evidence",)
+    """Misbehaviour detectors by name."""
+    variants: tuple[Literal["clean", "glass", "rain"], ...] = ("clean", "glass", "rain")
+    """Returns as simulated, through glass, or in rain."""
+    towns: tuple[str, ...] = ("Town07",)
+    """Towns of the drives, in turn; those of training or validation."""
+    drives: TrialCount = 30
+    """Number of drives; each is simulated, and no cloud is stored."""
+    seconds: DurationS = 60.0
+    """Length of a drive, seconds."""
+    position_sigma_m: LengthM = 0.4
+    """Standard deviation of the prior positions of senders, metres."""
+    heading_sigma_deg: AngleDeg = 0.4
+    """Standard deviation of the prior headings of senders, degrees."""
+    seed: Seed = 0
+    """Of scenes, pose errors, losses and returns."""
+    workers: WorkerCount = 1
+    """Processes that share the drives; results do not depend on it."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -23,11 +23,15 @@ from manyeyes.studies.attacks.interface import Attack
 
 @dataclass(frozen=True)
 class NamedAttack:
-    """An attack of the table. num_malicious: agents that attack by default. colluding: they share one random key."""
+    """An attack of the table. num_malicious: agents that attack by default. colluding: they share one random key.
+
+    needs_tokens: it changes nothing in messages without tokens.
+    """
 
     attack: Attack
     num_malicious: int = 1
     colluding: bool = False
+    needs_tokens: bool = False
 
 
 ATTACKS: dict[str, NamedAttack] = {
@@ -58,12 +62,12 @@ ATTACKS: dict[str, NamedAttack] = {
     "random-features": NamedAttack(FeatureNoiseAttack(1.0, scale=0.0)),
     "scale-4": NamedAttack(FeatureNoiseAttack(0.0, scale=4.0)),
     "poison": NamedAttack(FeatureNoiseAttack(saturate=True)),
-    "pgd-10-lower": NamedAttack(GradientAttack(10, 0.5, "lower")),
-    "pgd-10-raise": NamedAttack(GradientAttack(10, 0.5, "raise")),
-    "pgd-50-lower": NamedAttack(GradientAttack(50, 1.0, "lower")),
-    "pgd-50-raise": NamedAttack(GradientAttack(50, 1.0, "raise")),
-    "bim-10-lower": NamedAttack(GradientAttack(10, 0.25, "lower", random_start=False)),
-    "pgd-10-transfer": NamedAttack(GradientAttack(10, 0.5, "lower", knowledge="grey-box")),
+    "pgd-10-lower": NamedAttack(GradientAttack(10, 0.5, "lower"), needs_tokens=True),
+    "pgd-10-raise": NamedAttack(GradientAttack(10, 0.5, "raise"), needs_tokens=True),
+    "pgd-50-lower": NamedAttack(GradientAttack(50, 1.0, "lower"), needs_tokens=True),
+    "pgd-50-raise": NamedAttack(GradientAttack(50, 1.0, "raise"), needs_tokens=True),
+    "bim-10-lower": NamedAttack(GradientAttack(10, 0.25, "lower", random_start=False), needs_tokens=True),
+    "pgd-10-transfer": NamedAttack(GradientAttack(10, 0.5, "lower", knowledge="grey-box"), needs_tokens=True),
     "collude-3": NamedAttack(GhostAttack(3, "seen"), 2, colluding=True),
     "collude-3-blind": NamedAttack(GhostAttack(3, "blind"), 2, colluding=True),
     "sybil-8": NamedAttack(GhostAttack(3, "seen", num_pseudonyms=8)),

@@ -42,7 +42,7 @@ SPACING_M = 0.5
 class DriveSetting:
     """What one drive is played with. attack: None is none. colluding: malicious agents share one random key.
 
-    drops_malicious: messages of malicious agents do not reach the ego once the attack began, as of an oracle.
+    drops_malicious: messages of malicious agents never reach the ego, as of an oracle.
     """
 
     method: str
@@ -106,7 +106,7 @@ class AttackedDrive:
             else:
                 self._honest_packets[agent_id] = packets
         for agent_id, frame in frames.items():
-            is_dropped = setting.drops_malicious and agent_id in attackers and is_attacked
+            is_dropped = setting.drops_malicious and agent_id in attackers
             self._exchange.send(frame, [] if is_dropped else outgoing[agent_id], positions)
         latency_ns = round(setting.replay.latency_budget_s * 1e9)
         for agent_id in attackers & frames.keys():

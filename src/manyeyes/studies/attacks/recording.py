@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -86,18 +86,7 @@ class DriveRecorder:
 
     def senders(self) -> tuple[SenderRecord, ...]:
         """Return the record of each sender that was received."""
-        frames = range(self.num_frames)
-        return tuple(
-            SenderRecord(
-                self.ego,
-                sender,
-                sender in self.malicious,
-                _booleans(at in rows for at in frames),
-                torch.tensor([rows.get(at, SenderFrame()).trust for at in frames], dtype=torch.float64),
-                _booleans(at in rows and rows[at].is_named for at in frames),
-            )
-            for sender, rows in sorted(self._senders.items())
-        )
+        return make_sender_records(self.ego, self._senders, self.malicious, self.num_frames)
 
     def claims(self) -> tuple[ClaimRecord, ...]:
         """Return the record of each false claim."""
@@ -116,6 +105,24 @@ class DriveRecorder:
             )
             for (sender, claim), rows in sorted(self._claims.items())
         )
+
+
+def make_sender_records(
+    ego: int, senders: Mapping[int, Mapping[int, SenderFrame]], malicious: frozenset[int], num_frames: int
+) -> tuple[SenderRecord, ...]:
+    """Return the records of senders, each by the number of the frame."""
+    frames, absent = range(num_frames), SenderFrame()
+    return tuple(
+        SenderRecord(
+            ego,
+            sender,
+            sender in malicious,
+            _booleans(at in rows for at in frames),
+            torch.tensor([rows.get(at, absent).trust for at in frames], dtype=torch.float64),
+            _booleans(rows.get(at, absent).is_named for at in frames),
+        )
+        for sender, rows in sorted(senders.items())
+    )
 
 
 def find_sender_frames(perception: Perception) -> dict[int, SenderFrame]:

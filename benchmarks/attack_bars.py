@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Print the bars of misbehaviour detection: ``python benchmarks/attack_bars.py attacks.json [false-accusations.json]``.
+
+Each line states a bar, the measured quantity with its interval and number of samples, and whether it is met: where the whole 95 %
+interval is on the right side. "Not met" is where all of it is on the wrong side, else the result is inconclusive.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+MAX_LOSS_TO_ORACLE, MAX_CLEAN_COST = 0.01, 0.003
+MIN_NAMED_5, MIN_NAMED_10, MIN_NAMED_SEEN = 0.95, 0.99, 0.80
+MAX_ACCUSATION_RATE, MIN_SENDER_MINUTES = 0.01, 300.0
+MIN_NAMED_COLLUDING = 0.80
+COLLUDING, PERSISTENT_SEEN = ("collude-3",), ("ghost-1-seen", "ghost-3-seen", "ghost-10-seen")
+NO_ATTACK, NO_DEFENCE, ORACLE = "none", "none", "oracle"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A quantity that a bar bounds: at least minimum, at most maximum. n: number of samples, in words."""
+
+    bar: str
+    name: str
+    value: float
+    low: float
+    high: float
+    n: str
+    minimum: float = -math.inf
+    maximum: float = math.inf
+
+    @property
+    def verdict(self) -> str:
+        """Return met, not met or inconclusive."""
+        if any(map(math.isnan, (self.value, self.low, self.high))):
+            return "inconclusive"
+        if self.low >= self.minimum and self.high <= self.maximum:
+            return "met"
+        return "not met" if self.high < self.minimum or self.low > self.maximum else "inconclusive"
+
+    def __str__(self) -> str:
+        bound = f">= {self.minimum:g}" if math.isfinite(self.minimum) else f"<= {self.maximum:g}"
+        spread = f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]"
+        return f"{self.verdict:12}  bar {self.bar}  {self.name}: {spread}, n = {self.n}; bar {bound}"
+
+
+def measure_attacks(rows: list[dict[str, Any]]) -> Iterator[Measured]:
+    """Yield bars 1, 2, 4 and 5 of the rows of the study attacks."""
+    for row in rows:
+        name = f"{row['method']}, {row['attack']} x{row['num_malicious']}, {row['defence']}"
+        scenarios = f"{row['num_scenarios']} scenarios"
+        if row["defence"] in (NO_DEFENCE, ORACLE):
+            continue
+        if row["attack"] == NO_ATTACK:
+            yield _difference("1", f"{name}: clean cost", row["vs_clean"], scenarios, minimum=-MAX_CLEAN_COST)
+            continue
+        if row["attack"] not in COLLUDING:
+            yield _difference(
+                "1", f"{name}: defended - oracle", row["vs_oracle"], scenarios, minimum=-MAX_LOSS_TO_ORACLE
+            )
+        yield _difference(
+            "5" if row["attack"] in COLLUDING else "1", f"{name}: defended - alone", row["vs_alone"], scenarios, 0.0
+        )
+        for proportion, minimum, text in zip(row["named_checkable"], (MIN_NAMED_5, MIN_NAMED_10), ("5", "10")):
+            if proportion["total"]:
+                yield _proportion("2", f"{name}: checkable, named within {text} frames", proportion, minimum)
+        if row["attack"] in PERSISTENT_SEEN and row["named"][0]["total"]:
+            yield _proportion("2", f"{name}: on seen road, named within 5 frames", row["named"][0], MIN_NAMED_SEEN)
+        if row["attack"] in COLLUDING and row["named"][1]["total"]:
+            yield _proportion("5", f"{name}: named within 10 frames", row["named"][1], MIN_NAMED_COLLUDING)
+        surviving = row["blind"]["surviving"]
+        if surviving["successes"]:
+            yield _proportion(
+                "4", f"{name}: surviving uncheckable claims with stated evidence", row["blind"]["marked"], 1.0
+            )
+            yield _proportion("4", f"{name}: those of senders with trust >= 0.8", row["blind"]["trusted"], 1.0)
+
+
+def measure_accusations(rows: list[dict[str, Any]]) -> Iterator[Measured]:
+    """Yield bar 3 of the rows of the study false-accusations."""
+    for row in rows:
+        rate = row["accusations"]
+        value = rate["events"] / rate["minutes"] if rate["minutes"] else math.nan
+        n = f"{rate['minutes']:.1f} sender-minutes, {rate['events']} accusations"
+        if rate["minutes"] < MIN_SENDER_MINUTES:
+            n += f"; {MIN_SENDER_MINUTES:g} are asked"
+        upper = math.nan if rate["upper"] is None else rate["upper"]
+        yield Measured(
+            "3", f"{row['variant']}, {row['defence']}", value, rate["low"], upper, n, maximum=MAX_ACCUSATION_RATE
+        )
+
+
+def _difference(bar: str, name: str, pair: list[dict[str, Any]] | None, n: str, minimum: float) -> Measured:
+    if pair is None:
+        return Measured(bar, f"{name}, AP@0.5", math.nan, math.nan, math.nan, n, minimum)
+    values = [math.nan if pair[0][key] is None else pair[0][key] for key in ("value", "low", "high")]
+    return Measured(bar, f"{name}, AP@0.5", values[0], values[1], values[2], n, minimum)
+
+
+def _proportion(bar: str, name: str, stored: dict[str, Any], minimum: float) -> Measured:
+    value = stored["successes"] / stored["total"] if stored["total"] else math.nan
+    n = f"{stored['successes']} of {stored['total']}"
+    # Where every one of them is asked for, the observed fraction decides.
+    low = value if minimum == 1.0 else stored["low"]
+    return Measured(bar, name, value, low, value if minimum == 1.0 else stored["high"], n, minimum)
+
+
+def main() -> int:
+    """Print all bars; the exit code is 1 where one is not met."""
+    measured = list[Measured]()
+    for path in map(Path, sys.argv[1:]):
+        stored = json.loads(path.read_text(encoding="utf-8"))["result"]
+        measure = measure_accusations if stored["study"] == "false-accusations" else measure_attacks
+        measured += measure(stored["rows"])
+    measured.sort(key=lambda one: one.bar)
+    sys.stdout.write("".join(f"{one}\n" for one in measured))
+    sys.stdout.write("bar 6 is a test: tests/runtime/test_outsiders.py\n")
+    return int(any(one.verdict == "not met" for one in measured))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
