@@ -102,6 +102,8 @@ class Boxes:
         return self.center.shape[0]
 
     def __getitem__(self, index: Tensor | slice) -> Boxes:
+        if isinstance(index, Tensor) and index.dtype == torch.bool:
+            index = index.nonzero()[:, 0]  # once instead of for each field
         return Boxes(*(getattr(self, f.name)[index] for f in fields(self)))
 
     @classmethod

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -221,7 +222,7 @@ def _numbers(path: Path, content: Mapping[Any, Any], key: str, count: int, yaml_
         numbers = [float(v) for v in values]
     except (TypeError, ValueError, OverflowError):
         numbers = []
-    if len(numbers) != count or not np.isfinite(numbers).all():
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
         raise RecordingError(f"{path}: expected {count} finite numbers at '{name}', found {shorten(found)}; {_REMEDY}.")
     return numbers
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from manyeyes.datatypes import Boxes, Sites
+from manyeyes.training.detector._target_kernels import find_containing_boxes
 
 ROUNDS_BETWEEN_CHECKS = 2
 
@@ -157,6 +158,14 @@ def find_nearby_objects(sites: Sites, truth: Sequence[Boxes] | BoxBatch, config:
     """
     batch = truth if isinstance(truth, BoxBatch) else BoxBatch.of(truth, sites.key.device)
     margin = max(config.prune_margin_m, sites.grid.cell_size_m / 2)
+    if sites.key.device.type == "cpu":
+        columns = sites.xy.numpy(), sites.batch.numpy(), batch.places.contiguous().numpy(), batch.row.numpy()
+        return torch.from_numpy(find_containing_boxes(*columns, margin))
+    return _find_by_tensors(sites, batch, margin)
+
+
+def _find_by_tensors(sites: Sites, batch: BoxBatch, margin: float) -> Tensor:
+    """Do the same on any device."""
     (x, y, cosine, sine, half_length, half_width), row = batch.near(sites)
     if not row.numel():
         return torch.full_like(sites.key, -1)
