@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """DiscoNet (Li et al., NeurIPS 2021): one learned weight an agent and cell, a softmax over agents, and the weighted sum.
 
-The paper distils the fused features from a network on merged clouds; here there is no teacher.
+The fused features are distilled from a network on merged clouds (``training.detector.distillation``).
 """
 
 from __future__ import annotations

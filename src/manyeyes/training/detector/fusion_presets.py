@@ -39,6 +39,9 @@ INSIDE_FUSIONS = (
 """Fusions in mode inside; our own arms are instances, the merge by distance, and shift/fast, FAST on aligned senders."""
 BARE_FUSIONS = ("max", "attfuse", "v2vnet", "v2x-vit", "where2comm", "disconet", "sparsealign", "how2comm", "ermvp")
 """Fusions in mode bare: features alone are sent."""
+DISTILLATION = 10.0
+"""Weight of DiscoNet's distillation, a cell that student and teacher both have. CoAlign's code weighs 10^4 / C each cell of a dense
+map; most of them are empty and alike."""
 STAGE_C_FUSIONS = INSIDE_FUSIONS
 """Fusions with a preset that starts from random weights, to show whether the recipe decides the order."""
 
@@ -82,6 +85,8 @@ TABLE3_ROWS = {
 
 def _stage_b(fusion: str, **changes: Any) -> DetectorTrainConfig:
     config = replace(_STAGE_B, detector=replace(_STAGE_B.detector, fusion=fusion, **changes))
+    if fusion.removesuffix("/bare") == "disconet":
+        config = replace(config, loss=replace(config.loss, distillation=DISTILLATION))
     if not fusion.endswith("/bare"):
         return config
     return replace(config, degradation=replace(config.degradation, ego_history=0, sender_history=0))
@@ -90,6 +95,8 @@ def _stage_b(fusion: str, **changes: Any) -> DetectorTrainConfig:
 def _stage_c(fusion: str) -> DetectorTrainConfig:
     """Return 10,000 steps of the whole detector from random weights, with the samples of stage B."""
     config = replace(_stage_b(fusion), steps=10_000, learning_rate=1.5e-3, warmup_steps=200)
+    # Random weights teach nothing.
+    config = replace(config, loss=replace(config.loss, distillation=0.0))
     return replace(config, prune_warmup_start=0.02, prune_warmup_end=0.10)
 
 

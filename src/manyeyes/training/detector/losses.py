@@ -39,6 +39,7 @@ class LossConfig:
         information: InfoNCE of the selector (CoSTr Eq. 12).
         fusion_weight: fraction of the fused boxes' loss; the rest is that of single-agent boxes.
         target: reference of the mutual information; other values than own_task are for studies.
+        distillation: of the fused features from a teacher on merged clouds (DiscoNet); the teacher has the initial weights.
     """
 
     heat: float = 1.0
@@ -54,11 +55,12 @@ class LossConfig:
     information: float = 0.01
     fusion_weight: float = 0.5
     target: InformationTarget = "own_task"
+    distillation: float = 0.0
 
 
 @dataclass(frozen=True)
 class LossTerms:
-    """Unweighted loss terms of one batch, as scalars; fields as in LossConfig."""
+    """Unweighted loss terms of one batch, as scalars; fields as in LossConfig. distillation: None without a teacher."""
 
     heat: Tensor
     shape: Tensor
@@ -71,15 +73,21 @@ class LossTerms:
     prune: Tensor
     mask_l1: Tensor
     information: Tensor
+    distillation: Tensor | None = None
 
     def mix(self, other: LossTerms, share: float) -> LossTerms:
         """Interpolate linearly: this fraction of the other terms, the rest of these."""
-        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
-        return LossTerms(*((1 - share) * mine + share * theirs for mine, theirs in pairs))
+        theirs = other.computed()
+        mixed = {name: (1 - share) * mine + share * theirs[name] for name, mine in self.computed().items()}
+        return LossTerms(**mixed)
+
+    def computed(self) -> dict[str, Tensor]:
+        """Return the terms that there are, by name."""
+        return {f.name: term for f in fields(self) if (term := getattr(self, f.name)) is not None}
 
     def total(self, config: LossConfig) -> Tensor:
         """Return the weighted sum of all terms."""
-        return torch.stack([getattr(self, f.name) * getattr(config, f.name) for f in fields(self)]).sum()
+        return torch.stack([term * getattr(config, name) for name, term in self.computed().items()]).sum()
 
 
 def centre_focal(logit: Tensor, heat: Tensor, positive: Tensor) -> Tensor:

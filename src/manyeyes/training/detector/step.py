@@ -17,6 +17,7 @@ from manyeyes.models.detector.detector import Detector, ExtractedFeatures
 from manyeyes.models.fusion.transform_tokens import AgentTokens, to_ego_frame
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.window_attention import window_ids
+from manyeyes.training.detector.distillation import distillation_loss, teacher_features
 from manyeyes.training.detector.losses import LossTerms, heads_terms, prune_focal
 from manyeyes.training.detector.mutual_information import (
     STUDY_TARGETS,
@@ -57,7 +58,7 @@ class SingleAgentOutput:
 
 @dataclass(frozen=True)
 class ForwardOutput:
-    """Outputs for one batch of samples: single-agent boxes of every view and fused boxes of every ego.
+    """Outputs for one batch of samples: single-agent boxes of every view, fused boxes and features of every ego.
 
     shared_tokens: of each view, on a batch of grids. mask: (N,) in (0, 1), the selector's mask.
     """
@@ -67,6 +68,7 @@ class ForwardOutput:
     fused_boxes: RawBoxes
     shared_tokens: SparseBev
     mask: Tensor
+    fused_features: SparseBev
 
 
 def forward_single(model: Detector, samples: list[Sample], prune_threshold: float | None = None) -> SingleAgentOutput:
@@ -96,7 +98,8 @@ def forward(model: Detector, samples: list[Sample], prune_threshold: float | Non
     )
     tokens = to_ego_frame([*parts, *ego_history, *sender_history], shared.grid, len(samples))
     ego_past = to_ego_frame(ego_history, shared.grid, len(samples)) if ego_history else None
-    return ForwardOutput(single.features, single.boxes, model.fuse(tokens, ego_past)[1], shared, mask)
+    fused, boxes = model.fuse(tokens, ego_past)
+    return ForwardOutput(single.features, single.boxes, boxes, shared, mask, fused.bev)
 
 
 @dataclass(frozen=True)
@@ -202,11 +205,13 @@ def loss_terms(
     prune_threshold: float | None = None,
     fusion_weight: float = 0.5,
     target: InformationTarget = "own_task",
+    teacher: Detector | None = None,
 ) -> LossTerms:
     """Compute the losses of one batch: fused boxes against the merged ground truth, single-agent boxes against each
     agent's own.
 
     fusion_weight: fraction of the former; at 0 nothing is fused. target: reference of the selector's mutual information.
+    teacher: of the fused features, on merged clouds (``distillation``).
     """
     if fusion_weight == 0 and target == "own_task":
         single = forward_single(model, samples, prune_threshold)
@@ -221,7 +226,11 @@ def loss_terms(
     assigned = assign_targets(sites, BoxBatch.of(merged_boxes, out.mask.device), targets)
     both = add_class_heat(assigned, sites, merged_boxes, model.config.classes, targets)
     alone, fused = heads_terms((own.head, (out.fused_boxes, both)), *own.rest)
-    return alone.mix(fused, fusion_weight)
+    mixed = alone.mix(fused, fusion_weight)
+    if teacher is None:
+        return mixed
+    taught = teacher_features(teacher, samples, prune_threshold)
+    return replace(mixed, distillation=distillation_loss(out.fused_features, taught))
 
 
 @dataclass(frozen=True)

@@ -90,6 +90,7 @@ class DetectorTask(Task[DetectorTrainConfig, Detector, Sample]):
                 "validate_every needs a recording of validation; give one (--validation), or set it to 0."
             )
         self.config, self.seed, self._start, self._validation = config, seed, start, validation
+        self._teacher: Detector | None = None
         self._steps = config.steps or math.ceil(config.epochs * epoch_length(recording) / config.batch)
         self.stream = SampleStream(
             recording, config.detector.grid, config.augment, seed, config.degradation, config.detector.classes
@@ -122,8 +123,20 @@ class DetectorTask(Task[DetectorTrainConfig, Detector, Sample]):
         """Compute the losses of single-agent and fused boxes."""
         config = self.config
         threshold = prune_threshold(config, step, self.steps)
-        terms = loss_terms(model, samples, config.targets, threshold, config.loss.fusion_weight, config.loss.target)
-        return terms.total(config.loss), vars(terms)
+        teacher = self._make_teacher(model) if config.loss.distillation else None
+        weights = config.loss.fusion_weight, config.loss.target
+        terms = loss_terms(model, samples, config.targets, threshold, *weights, teacher)
+        return terms.total(config.loss), terms.computed()
+
+    def _make_teacher(self, model: Detector) -> Detector:
+        """Return the detector of the initial weights, frozen, on the device of a model."""
+        if self._start is None:
+            raise ConfigError("LossConfig.distillation needs initial weights, which are those of the teacher (--init).")
+        if self._teacher is None:
+            self._teacher = Detector(self.config.detector)
+            _load_weights(self._teacher, self._start)
+            self._teacher.eval().requires_grad_(False).to(model.device)
+        return self._teacher
 
     def validate(self, weights: Path) -> dict[str, float]:
         """Return AP@0.5 of intermediate fusion, where there are several agents, and of no fusion."""
