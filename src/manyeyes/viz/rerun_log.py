@@ -53,7 +53,7 @@ class RerunLog:
                 f"A target of the viewer is a file {SUFFIX}, or {URL_PREFIX}://HOST:PORT/proxy; got {target!r}."
             )
         self._rerun = import_extra("rerun", "rerun", "Logging for the viewer")
-        self._stream: Any = self._rerun.RecordingStream(name)
+        self._stream: Any = self._rerun.RecordingStream("manyeyes")
         self._file = Path(target) if is_file else None
         if self._file is not None:
             self._file.parent.mkdir(parents=True, exist_ok=True)
@@ -61,6 +61,7 @@ class RerunLog:
             self._stream.save(str(self._draft))
         else:
             self._stream.connect_grpc(target)
+        self._stream.send_recording_name(name)
         self._stream.log("world", self._rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def __enter__(self) -> RerunLog:
