@@ -124,3 +124,22 @@ def test_memory_does_not_need_the_frame_to_be_processed_before(detector) -> None
     counts = [len(cache.process_tokens(sweep(k)).shared_tokens.sites) for k in range(2)]
     _, past = IntermediateFusion(uses_history=True).gather(cache, sweep(2), ())
     assert past is not None and len(past.xy) == sum(counts)
+
+
+@pytest.mark.parametrize("name", ["intermediate", "intermediate-temporal"])
+def test_tokens_below_the_least_score_of_the_weights_are_not_sent_without_any_budget(name) -> None:
+    """The sender's own boxes stay as they are."""
+    now = sweep(0)
+
+    def play(least: float) -> tuple[torch.Tensor, Boxes]:
+        torch.manual_seed(0)
+        agent = Agent(Detector(replace(COSTR_TINY, min_sent_score=least)).eval(), get_strategy(name), budget_bytes=None)
+        message = get_strategy(name).compose_message(agent.perception_cache, now)
+        assert message is not None and message.token_score is not None
+        return message.token_score, agent.perceive(now).boxes
+
+    every, own = play(0.0)
+    least = float(every.median())
+    sent, same = play(least)
+    assert torch.equal(sent, every[every >= least]) and 0 < len(sent) < len(every)
+    assert len(own) and torch.equal(own.center, same.center)

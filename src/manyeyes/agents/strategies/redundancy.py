@@ -5,6 +5,8 @@ Receivers keep the last messages of a sender (``agents.message_history``), so a 
 has the highest value. A token's score is its confidence, reduced for each earlier token of the same object: more confident ones of
 the same message, and those of the last messages, which count once. CoSTr section III-E scores what a message adds to the receiver's
 features; here the sender uses its own messages instead. An object is sent again within three messages, in case they were lost.
+
+Tokens below the weights' ``DetectorConfig.min_sent_score`` score -inf, which no message holds, whatever its budget.
 """
 
 from __future__ import annotations
@@ -25,16 +27,22 @@ SAME_OBJECT_M = 2.0
 
 
 def novelty_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
-    """Return (N,) in [0, 1], of the shared tokens of a frame: sigmoid(heat) * REDUNDANCY_DECAY^(earlier tokens of the object)."""
+    """Return (N,) of the shared tokens of a frame: sigmoid(heat) * REDUNDANCY_DECAY^(earlier tokens of the object), or -inf."""
     tokens = cache.process_tokens(frame).shared_tokens
     sent_centres = [_propagate_centres(frame, then, sent) for then, sent in cache.recently_sent(frame)]
-    return _decay_scores(tokens, torch.cat([tokens.features.new_empty(0, 2), *sent_centres]))
+    score = _decay_scores(tokens, torch.cat([tokens.features.new_empty(0, 2), *sent_centres]))
+    return _drop_low(cache, score)
 
 
 def distinct_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
     """Return ``novelty_score`` for receivers that remember no message: only tokens of the same message count as earlier."""
     tokens = cache.process_tokens(frame).shared_tokens
-    return _decay_scores(tokens, tokens.features.new_empty(0, 2))
+    return _drop_low(cache, _decay_scores(tokens, tokens.features.new_empty(0, 2)))
+
+
+def _drop_low(cache: PerceptionCache, score: Tensor) -> Tensor:
+    """Return the scores (N,) with -inf for those below the least one of the weights; detectors of third parties may have none."""
+    return score.masked_fill(score < getattr(cache.detector, "min_sent_score", 0.0), -torch.inf)
 
 
 def _decay_scores(tokens: SparseBev, sent_centres: Tensor) -> Tensor:

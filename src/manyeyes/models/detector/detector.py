@@ -45,6 +45,7 @@ class DetectorConfig:
         sweeps: number of consecutive sweeps in the input.
         codebook: of the token encoding; None before one is fitted.
         classes: of objects that are detected, of ``datatypes.CLASSES``; one heat map for each.
+        min_sent_score: tokens of a lower score are not sent, in [0, 1) (``agents.strategies.redundancy``); 0 sends all.
     """
 
     grid: BevGrid
@@ -62,6 +63,7 @@ class DetectorConfig:
     codebook: CodebookConfig | None = None
     # Absent from stored configurations where it is the default, so that fingerprints of earlier weights hold.
     classes: tuple[str, ...] = field(default=VEHICLES, metadata={"omit_default": True})
+    min_sent_score: FiniteFloat = field(default=0.0, metadata={"omit_default": True})
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,11 @@ class Detector(nn.Module):
     def classes(self) -> tuple[str, ...]:
         """Classes of objects that are detected, and evaluated apart."""
         return self.config.classes
+
+    @property
+    def min_sent_score(self) -> float:
+        """Tokens of a lower score are not sent."""
+        return self.config.min_sent_score
 
     @property
     def token_grid(self) -> BevGrid:

@@ -60,6 +60,11 @@ class TokenDetector(BoxDetector, Protocol):
     codebook: Codebook | None
 
     @property
+    def min_sent_score(self) -> float:
+        """Tokens of a lower redundancy-aware score are not sent; 0 by default, which sends all."""
+        return 0.0
+
+    @property
     def token_grid(self) -> BevGrid:
         """The grid of the tokens."""
         ...
