@@ -293,7 +293,7 @@ def _train_plan(
         last = at
 
     with ExitStack() as files:
-        given = next(iter(map(str, options.weights)), plan.start)
+        given = next(iter(map(str, options.weights)), None)
         start = files.enter_context(pretrained.open_detector_file(given)) if given else None
         card = {**_make_card(options, plan), "preset": options.preset, "data": [str(path) for path in options.data]}
         validation = _open_validation(options)

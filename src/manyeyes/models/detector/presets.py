@@ -42,7 +42,7 @@ COSTR_SMALL = DetectorConfig(
 """Half of OPV2V's range and a narrow network: trains on two CPU cores in about an hour."""
 
 COSTR_BASE = replace(COSTR_SMALL, grid=BASE_GRID)
-"""The network of costr-small at OPV2V's full range: its weights are trained on from those of costr-small."""
+"""The network of costr-small at OPV2V's full range."""
 
 COSTR_OPV2V = DetectorConfig(
     grid=OPV2V_GRID,

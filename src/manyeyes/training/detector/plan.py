@@ -40,7 +40,6 @@ class TrainPlan:
     Attributes:
         stages: name and settings of each stage; stage k is trained with the seed of the plan plus k.
         released: configuration of the weights that ship, with tensors of the same shapes; None for that of the last stage.
-        start: shipped weights that the first stage begins from where none are given; None for random ones.
         codebook: settings of the codebook that is fitted after the last stage; "start" for that of the initial weights; None for no
             codebook.
         codebook_frames: maximum number of evaluated frames that the codebook is fitted to, spread evenly.
@@ -50,7 +49,6 @@ class TrainPlan:
     stages: tuple[tuple[str, DetectorTrainConfig], ...]
     _: KW_ONLY
     released: DetectorConfig | None = None
-    start: str | None = None
     codebook: CodebookConfig | Literal["start"] | None = CodebookConfig()
     codebook_frames: int = 400
     calibration_frames: int = 300

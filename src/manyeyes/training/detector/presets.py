@@ -55,8 +55,6 @@ def _mix_sensors(config: DetectorTrainConfig) -> DetectorTrainConfig:
     return replace(config, augment=replace(config.augment, sensors=_MIXTURE))
 
 
-_SENSORS = replace(_mix_sensors(_FINAL), steps=4000, learning_rate=6e-4, warmup_steps=100, prune_warmup_end=0.001)
-"""Trains finished weights on over the mixture of sensors and intensity laws."""
 _BRANCH = replace(
     _FINAL,
     degradation=replace(_FINAL.degradation, sender_history=2),
@@ -111,8 +109,8 @@ DETECTOR_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {
     ),
     "costr-small/stage3": _mix_sensors(_DEGRADED),
     "costr-small/stage4": _mix_sensors(_FINAL),
-    "costr-base/stage5": _widen(_mix_sensors(_DEGRADED), steps=3000, learning_rate=6e-4),
-    "costr-base/stage6": _widen(_mix_sensors(_FINAL), steps=4000, learning_rate=6e-4),
+    "costr-small/stage5": _widen(_mix_sensors(_DEGRADED), steps=3000, learning_rate=6e-4),
+    "costr-small/stage6": _widen(_mix_sensors(_FINAL), steps=4000, learning_rate=6e-4),
     "ablation/none": _branch(**_PLAIN, encoder=_FINE_ONLY),
     "ablation/se": _branch(**_PLAIN),
     "ablation/se-dast": _branch(fusion="max"),
@@ -137,7 +135,7 @@ DETECTOR_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {
 }
 """costr-small/stage1 to stage4, each initialised with the weights of the stage before: stage2 adds the wider range, all agents
 and the IoU loss; stage3 adds history, delay, pose errors, packet loss, budgets, and drawn sensors and intensity laws; stage4
-prunes more cells, object by object. costr-base/stage5 and stage6 go on at twice the range. ablation/*: rows of the ablation, each
+prunes more cells, object by object; stage5 and stage6 repeat both at twice the range. ablation/*: rows of the ablation, each
 trained on from the shipped weights for the same number of steps. costr-opv2v, costr-v2xset, costr-dair and
 costr-v2x-real: the published data sets, 80 + 10 epochs as in the paper. costr-tiny: tests and examples.
 """
@@ -147,21 +145,20 @@ def _stages(prefix: str, *names: str) -> tuple[tuple[str, DetectorTrainConfig], 
     return tuple((name, DETECTOR_TRAINING_PRESETS[f"{prefix}/{name}"]) for name in names)
 
 
-_SMALL_STAGES = _stages("costr-small", "stage1", "stage2", "stage3", "stage4")
-_WIDE_STAGES = _stages("costr-base", "stage5", "stage6")
-_SMALL_DECODE = replace(COSTR_SMALL.decode, iou_score_weight=0.7)
-_SMALL_RELEASED = replace(_FINAL.detector, grid=BevGrid(-102.4, -102.4, -5.0, 102.4, 102.4, 6.0), decode=_SMALL_DECODE)
-_BASE_RELEASED = replace(_WIDE_STAGES[-1][1].detector, decode=_SMALL_DECODE)
+_STAGES = _stages("costr-small", *(f"stage{number}" for number in range(1, 7)))
+_RELEASED = replace(
+    _FINAL.detector, prune_threshold=0.1, min_sent_score=0.05, decode=replace(COSTR_SMALL.decode, iou_score_weight=0.7)
+)
+_SMALL_RELEASED = replace(_RELEASED, grid=BevGrid(-102.4, -102.4, -5.0, 102.4, 102.4, 6.0))
+_BASE_RELEASED = replace(_RELEASED, grid=BASE_SQUARE_GRID, output_range=COSTR_BASE.grid)
 
 DETECTOR_PLANS: dict[str, TrainPlan] = {
-    "costr-small": TrainPlan(_SMALL_STAGES, released=_SMALL_RELEASED),
-    "costr-small/sensors": TrainPlan((("sensors", _SENSORS),), released=_SMALL_RELEASED, start="costr-small"),
-    "costr-base": TrainPlan((*_SMALL_STAGES, *_WIDE_STAGES), released=_BASE_RELEASED),
-    "costr-base/wide": TrainPlan(_WIDE_STAGES, released=_BASE_RELEASED, start="costr-small"),
+    "costr-small": TrainPlan(_STAGES, released=_SMALL_RELEASED),
+    "costr-base": TrainPlan(_STAGES, released=_BASE_RELEASED),
     "costr-tiny/plan": TrainPlan(
         tuple((f"stage{k}", DETECTOR_TRAINING_PRESETS["costr-tiny"]) for k in (1, 2)), codebook_frames=4
     ),
 }
-"""From nothing to weights with a codebook. costr-small: its four stages. costr-base: those, then two at OPV2V's range.
-costr-small/sensors and costr-base/wide: the shipped costr-small, or given weights, trained on. costr-tiny/plan: tests.
+"""From nothing to weights with a codebook. costr-small, costr-base: the same six stages, released at the range of each, with a
+codebook and a calibration of its own. costr-tiny/plan: tests.
 """
