@@ -24,6 +24,8 @@ from manyeyes.studies.detection import robustness
 from manyeyes.studies.detection.perturbations import CLEAN, COMBINED_SEVERE, Perturbation, select_perturbations
 from manyeyes.studies.engine import replay_study
 from manyeyes.viz.curves import CurvePanel
+from manyeyes.viz.stored_tables import StoredResult, make_tables
+from manyeyes.viz.table import StoredTable
 
 HALF = torch.tensor([2.3, 0.95, 0.8])
 
@@ -94,6 +96,11 @@ def evaluate(data: Path, weights: Path, out: Path, study: str, *words: object) -
     return json.loads((out / f"{study}.json").read_text())
 
 
+def list_tables(path: Path) -> tuple[StoredTable, ...]:
+    """The tables of a document for a stored study."""
+    return make_tables(StoredResult(path, json.loads(path.read_text())["result"], "", "", (0,), "test"))
+
+
 @pytest.fixture
 def small_set(monkeypatch) -> tuple:
     """Six of the disturbances."""
@@ -126,6 +133,11 @@ def test_robustness_has_a_row_per_perturbation_and_method(data, weights, tmp_pat
     assert [c["description"] for c in comparisons[-3:]] == [
         f"intermediate, {level} - clean" for level in ("0.4 s", "0.8 m", "30 % loss")
     ]
+    table = next(t for t in list_tables(tmp_path / "robustness.json") if t.name == "robustness")
+    assert (
+        table.lines[0] == ("perturbation", "no-fusion", "late", "intermediate")
+        and len(table.lines) == 1 + len(rows) // 2
+    )
     assert all("margin" not in c and "verdict" not in c for c in comparisons), "targets are not the package's"
     assert [p.title for p in panels] == ["Delay", "Heading noise", "Position noise", "Packet loss", "Combined"]
     assert {c.label: c.x for c in panels[0].curves} == {
@@ -202,6 +214,15 @@ def test_the_main_table_states_parameters_and_both_counts_of_bytes(main_table, w
     assert rows["F-Cooper"]["paper_bytes"] == grid.shape[0] * grid.shape[1] * channels * 4
     assert rows["no-fusion"]["paper_bytes"] == rows["no-fusion"]["bytes_per_message"] == 0
     assert rows["intermediate"]["paper_bytes"] > rows["intermediate"]["bytes_per_message"] / 2 > 0
+
+
+@pytest.mark.slow
+def test_documents_tabulate_a_stored_main_table(main_table) -> None:
+    tables = {table.name: table.lines for table in list_tables(main_table / "main-table.json")}
+    assert {"ap50-its-g5-6-off", "ap70-its-g5-6-voting", "operating-point", "cost", "channel-its-g5-6"} <= set(tables)
+    assert tables["ap50-its-g5-6-off"][0] == ("method", "clean", "0.8 m")
+    assert [line[0] for line in tables["cost"][1:3]] == ["no-fusion", "no-fusion-temporal"]
+    assert len(tables["ap50-its-g5-6-voting"]) == 1 + 2 + 5
 
 
 @pytest.mark.slow
@@ -322,6 +343,7 @@ def test_every_method_has_a_curve_over_budgets_of_its_own(data, weights, tmp_pat
         ("AP@0.5", True, [0, 3, 3, 3]), ("AP@0.7", True, [0, 3, 3, 3]),
     ]  # fmt: skip
     assert rows[5]["command"].endswith("--budgets 1398 --rows intermediate")
+    assert [t.name for t in list_tables(tmp_path / "byte-curves.json")] == ["ap-against-bytes-without-memory"]
 
 
 @pytest.mark.slow

@@ -167,7 +167,7 @@ def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
     [
         ("<!-- report: all -->\n", "page: the marker .* has no"),
         (f"<!-- report: all -->\n<!-- report: all -->\n{END}\n", "page: the marker .* has no"),
-        (f"<!-- report: empty -->\n{END}\n", r"empty: no stored result"),
+        (f"<!-- report: picture p.png -->\n{END}\n", "page: a marker of a picture is"),
         (f"<!-- report: all/a-evaluate.json other -->\n{END}\n", "has no table other; it has methods"),
         (f"<!-- report: seeds late -->\n{END}\n", "page: a marker of seeds is"),
     ],
@@ -175,6 +175,91 @@ def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
 def test_bad_markers_are_refused(root: Path, text: str, match: str) -> None:
     with pytest.raises(ConfigError, match=match):
         update_text(text, root / "benchmarks/results", "page")
+
+
+@pytest.mark.parametrize(
+    "marker", ["none.json", "none.json methods", "folder", "picture none.png A plot", "seeds late ours=none.json"]
+)
+def test_what_is_not_stored_reads_not_run(root: Path, marker: str) -> None:
+    path = "folder" if marker == "folder" else "none.png" if "picture" in marker else "none.json"
+    text = update_text(f"<!-- report: {marker} -->\nold\n{END}\n", root / "benchmarks/results", "pages/p.md")
+    assert text.splitlines()[2:] == [f"*not run: `benchmarks/results/{path}` is not stored.*", END]
+    assert update_text(text, root / "benchmarks/results", "pages/p.md") == text
+
+
+def test_a_picture_is_linked_from_the_folder_of_the_document(root: Path) -> None:
+    (root / "benchmarks/results/curves.png").write_bytes(b"")
+    text = f"<!-- report: picture curves.png AP against bytes -->\n{END}\n"
+    for name, path in (("README.md", "benchmarks"), ("pages/more/p.md", "../../benchmarks")):
+        link = f"![AP against bytes]({path}/results/curves.png)"
+        assert update_text(text, root / "benchmarks/results", name).splitlines()[2] == link
+
+
+def perturbation(delay_s: float = 0.0, packet_loss: float = 0.0) -> dict[str, float]:
+    return {"delay_s": delay_s, "heading_sigma_deg": 0.0, "position_sigma_m": 0.0, "packet_loss": packet_loss}
+
+
+def main_row(method: str, channel: str, at: dict[str, float], value: float, corrector: str = "off") -> dict[str, Any]:
+    return {
+        "method": method, "channel": channel, "perturbation": at, "corrector": corrector, "bytes_per_message": 1234.4,
+        "answer_ap": [interval(value), interval(value / 2)], "paper_bytes": None, "age_ms": 4.0, "answer_ms": 115.0,
+        "legacy_ap": [interval(0.3), interval(0.2)], "point": evaluation()["operating_rows"][0]["point"], "compute_ms": 15.0,
+        "parameters": {"fusion": 127555, "whole": 810000},
+    }  # fmt: skip
+
+
+def test_the_main_table_is_methods_by_disturbances(tmp_path: Path) -> None:
+    rows = [main_row("no-fusion", "any channel", perturbation(), 0.5)]
+    rows += [
+        main_row("late", channel, at, value, corrector)
+        for channel in ("its-g5-6", "ideal")
+        for at, value in ((perturbation(), 0.9), (perturbation(0.4, 0.3), 0.8))
+        for corrector in ("off", "voting")
+    ]
+    printed = {"title": "Channel: its-g5-6", "headings": ["method"], "lines": [["late"]]}
+    result = {"study": "main-table", "rows": rows, "tables": [printed]}
+    tables = {table.name: table.lines for table in make_tables(load_result(write(tmp_path / "m.json", result)))}
+    assert list(tables)[:4] == [
+        "ap50-its-g5-6-off",
+        "ap70-its-g5-6-off",
+        "ap50-its-g5-6-voting",
+        "ap70-its-g5-6-voting",
+    ]
+    alone = "0.500 [0.400, 0.600]"
+    assert tables["ap50-ideal-voting"] == [
+        ("method", "clean", "0.4 s, 30 % loss"),
+        ("no-fusion", alone, alone),
+        ("late", "0.900 [0.800, 1.000]", "0.800 [0.700, 0.900]"),
+    ]
+    assert tables["cost"][1:] == [
+        (name, "1,234", "-", "4", "115", "15", "127,555", "810,000") for name in ("no-fusion", "late")
+    ]
+    assert tables["operating-point"][1][0] == "no-fusion" and len(tables["operating-point"]) == 3
+    assert tables["channel-its-g5-6"] == [("method",), ("late",)]
+
+
+def test_robustness_is_perturbations_by_methods_of_one_form(tmp_path: Path) -> None:
+    rows = [
+        {"method": method, "perturbation": at, "ap": [interval(value), interval(None)]}
+        for method, value in (("no-fusion", 0.5), ("late", 0.7), ("late-temporal", 0.8))
+        for at in (perturbation(), perturbation(0.1))
+        if method != "no-fusion" or at == perturbation()
+    ]
+    result = {"study": "robustness", "rows": rows}
+    tables = {table.name: table.lines for table in make_tables(load_result(write(tmp_path / "r.json", result)))}
+    assert tables["robustness"] == [
+        ("perturbation", "no-fusion", "late"),
+        ("clean", "0.500 [0.400, 0.600]", "0.700 [0.600, 0.800]"),
+        ("0.1 s", "-", "0.700 [0.600, 0.800]"),
+    ]
+    assert tables["robustness-temporal-ap70"][1] == ("clean", "-") and len(tables) == 4
+
+
+def test_tables_that_a_study_printed_are_those_of_the_document(tmp_path: Path) -> None:
+    printed = {"title": "AP against bytes, with memory", "headings": ["method", "AP"], "lines": [["late", "0.9"]]}
+    result = {"study": "byte-curves", "rows": [], "tables": [printed]}
+    (table,) = make_tables(load_result(write(tmp_path / "b.json", result)))
+    assert (table.name, table.lines) == ("ap-against-bytes-with-memory", [("method", "AP"), ("late", "0.9")])
 
 
 def test_one_table_of_a_file_is_chosen_by_its_name(root: Path) -> None:

@@ -4,17 +4,18 @@
 A marker is a comment on a line of its own, the table stands below it, and ``<!-- end of report -->`` ends it. Paths are below
 ``benchmarks/results``:
 
-- ``<!-- report: FILE.json -->`` or ``<!-- report: FOLDER -->``: all tables of a file, or of all files of a folder by name, -
-``<!-- report: FILE.json TABLE ... -->``: some of its tables, by name (``methods``, ``operating-point``, ``differences``, ...),
+- ``<!-- report: FILE.json -->`` or ``<!-- report: FOLDER -->``: all tables of a file, or of all files of a folder by name;
+- ``<!-- report: FILE.json TABLE ... -->``: some of its tables, by name (``methods``, ``operating-point``, ``differences``, ...);
 - ``<!-- report: seeds STRATEGY NAME=FILE.json,FILE.json NAME=... -->``: methods that were trained from several seeds;
-differences are
-  those of the first to the others.
+  differences are those of the first to the others;
+- ``<!-- report: picture FILE.png TEXT -->``: a picture that a study drew, with its text.
 
-Below the tables of a file stands where its numbers come from.
+Below the tables of a file stands where its numbers come from. What is not stored yet reads "not run".
 """
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from pathlib import Path
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.viz.stored_tables import StoredTable, load_result, make_seed_tables, make_tables
-from manyeyes.viz.table import format_markdown_lines
+from manyeyes.viz.table import NOT_RUN, format_markdown_lines
 
 RESULTS = Path("benchmarks/results")
 END = "<!-- end of report -->"
@@ -73,10 +74,13 @@ def _make_parts(words: Sequence[str], results: Path, name: str) -> Iterator[str]
     if words[0] == "seeds":
         yield from _make_seed_parts(words[1:], results, name)
         return
+    if words[0] == "picture":
+        yield _make_picture(words[1:], results, name)
+        return
     path = results / words[0]
-    files = sorted(path.glob("*.json")) if path.is_dir() else [path]
+    files = sorted(path.glob("*.json")) if path.is_dir() else [path] if path.is_file() else []
     if not files:
-        raise ConfigError(f"{name}: the folder {path} has no .json file of results.")
+        yield _name_missing(words[0])
     for file in files:
         stored = load_result(file)
         tables = make_tables(stored)
@@ -89,11 +93,33 @@ def _make_parts(words: Sequence[str], results: Path, name: str) -> Iterator[str]
         yield f"{stored.origin}\n"
 
 
+def _name_missing(path: str) -> str:
+    """Return the text of results that are not stored yet."""
+    return f"*{NOT_RUN}: `{RESULTS / path}` is not stored.*\n"
+
+
+def _make_picture(words: Sequence[str], results: Path, name: str) -> str:
+    if len(words) < 2:
+        raise ConfigError(
+            f"{name}: a marker of a picture is 'picture FILE.png TEXT'; got {' '.join(words) or 'nothing'}."
+        )
+    path = results / words[0]
+    if not path.is_file():
+        return _name_missing(words[0])
+    root = results.parents[len(RESULTS.parts) - 1]
+    return f"![{' '.join(words[1:])}]({Path(os.path.relpath(path, (root / name).parent)).as_posix()})\n"
+
+
 def _make_seed_parts(words: Sequence[str], results: Path, name: str) -> Iterator[str]:
     pairs = [word.partition("=") for word in words[1:]]
     if not pairs or not all(method and files for method, _, files in pairs):
         raise ConfigError(f"{name}: a marker of seeds is 'seeds STRATEGY NAME=FILE,FILE ...'; got {' '.join(words)}.")
-    runs = [(method, load_result(results / file)) for method, _, files in pairs for file in files.split(",")]
+    named = [(method, file) for method, _, files in pairs for file in files.split(",")]
+    missing = [file for _, file in named if not (results / file).is_file()]
+    if missing:
+        yield _name_missing(missing[0])
+        return
+    runs = [(method, load_result(results / file)) for method, file in named]
     yield from _format_tables(make_seed_tables(runs, words[0]), has_titles=True)
     yield from (f"- {method}: {stored.origin}" for method, stored in runs)
     yield ""

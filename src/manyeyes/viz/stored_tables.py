@@ -22,20 +22,16 @@ from manyeyes.evaluation.statistics.training_seeds import (
     compute_pooled_std,
     summarize_seeds,
 )
+from manyeyes.viz.stored_study_tables import (
+    format_stored_interval,
+    make_main_tables,
+    make_printed_tables,
+    make_robustness_tables,
+)
 from manyeyes.viz.study_table import format_difference, format_interval as format_value
-from manyeyes.viz.table import add_class_column
+from manyeyes.viz.table import Lines, StoredTable, add_class_column
 
-Lines = list[tuple[str, ...]]
 _IOUS = ("AP@0.5", "AP@0.7")
-
-
-@dataclass(frozen=True)
-class StoredTable:
-    """A table of a document. name: by which a marker selects it; lines: headings first."""
-
-    name: str
-    title: str
-    lines: Lines
 
 
 @dataclass(frozen=True)
@@ -122,17 +118,8 @@ def make_tables(stored: StoredResult) -> tuple[StoredTable, ...]:
         if isinstance(result, dict) and fits(result):
             return tuple(make(result))
     raise ConfigError(
-        f"{stored.path}: no result of evaluate, finetune, study sensors, study strata, unseen_scenes.py or speed.py; no table is "
-        "known for it."
+        f"{stored.path}: no result of evaluate, finetune, a study, unseen_scenes.py or speed.py; no table is known for it."
     )
-
-
-def _format_interval(interval: dict[str, Any] | None, spec: str = ".3f") -> str:
-    """Format a stored number with its interval; "-" where there is none."""
-    if interval is None or interval["value"] is None or math.isnan(interval["value"]):
-        return "-"
-    text = f"{interval['value']:{spec}}"
-    return f"{text} [{interval['low']:{spec}}, {interval['high']:{spec}}]" if interval["num_scenarios"] > 1 else text
 
 
 def _format_bytes(number: float | None) -> str:
@@ -142,7 +129,7 @@ def _format_bytes(number: float | None) -> str:
 def _make_evaluation(result: dict[str, Any]) -> list[StoredTable]:
     lines: Lines = [("method", *_IOUS, "bytes/message")]
     for row in result["rows"]:
-        ap = (_format_interval(row["ap50"]), _format_interval(row["ap70"]))
+        ap = (format_stored_interval(row["ap50"]), format_stored_interval(row["ap70"]))
         lines.append((row["method"], *ap, _format_bytes(row["bytes_per_message"])))
     classes = [row.get("class_name", "vehicle") for row in result["rows"]]
     tables = [StoredTable("methods", "Methods", add_class_column(lines, classes))]
@@ -151,7 +138,8 @@ def _make_evaluation(result: dict[str, Any]) -> list[StoredTable]:
     if result.get("differences"):
         differences: Lines = [("paired difference", "metric", "ΔAP [95 % CI]")]
         differences += [
-            (d["description"], d["metric"], _format_interval(d["interval"], "+.3f")) for d in result["differences"]
+            (d["description"], d["metric"], format_stored_interval(d["interval"], "+.3f"))
+            for d in result["differences"]
         ]
         tables.append(StoredTable("differences", "Paired differences", differences))
     return tables
@@ -170,7 +158,7 @@ def _make_operating_table(result: dict[str, Any]) -> StoredTable:
             point[name]
             for name in ("precision", "recall", "f_score", "false_alarms_per_frame", "duplicates_per_object")
         ]
-        cells = (_format_interval(value) for value in (*values, *row["legacy_ap"]))
+        cells = (format_stored_interval(value) for value in (*values, *row["legacy_ap"]))
         lines.append((row["method"], f"{point['threshold']['score']:.3f} ({point['threshold']['source']})", *cells))
     classes = [row["class_name"] for row in result["operating_rows"]]
     threshold = result["protocol"]["score_threshold"]
@@ -181,7 +169,7 @@ def _make_operating_table(result: dict[str, Any]) -> StoredTable:
 def _make_strata(result: dict[str, Any]) -> list[StoredTable]:
     lines: Lines = [("stratum", "method", "scenarios", *_IOUS, "bytes/message")]
     for row in result["rows"]:
-        ap = tuple(map(_format_interval, row["ap"]))
+        ap = tuple(map(format_stored_interval, row["ap"]))
         lines.append(
             (row["stratum"], row["method"], str(row["num_scenarios"]), *ap, _format_bytes(row["bytes_per_message"]))
         )
@@ -195,7 +183,7 @@ def _make_sensors(result: dict[str, Any]) -> list[StoredTable]:
         cells = {(row["law"], _name_column(row)): row["ap"][0] for row in mine}
         laws, columns = (list(dict.fromkeys(names)) for names in zip(*cells))
         lines: Lines = [("intensity", *columns)]
-        lines += [(law, *(_format_interval(cells.get((law, column))) for column in columns)) for law in laws]
+        lines += [(law, *(format_stored_interval(cells.get((law, column))) for column in columns)) for law in laws]
         tables.append(StoredTable(f"sensors-{method}", f"AP@0.5 by sensor, {method}", lines))
     return tables
 
@@ -219,7 +207,7 @@ def _make_cases(result: dict[str, Any]) -> list[StoredTable]:
 def _make_finetune(result: dict[str, Any]) -> list[StoredTable]:
     lines: Lines = [("weights", "method", *_IOUS, "bytes/message")]
     for row in result["rows"]:
-        ap = tuple(map(_format_interval, row["ap"]))
+        ap = tuple(map(format_stored_interval, row["ap"]))
         lines.append((row["weights"], row["method"], *ap, _format_bytes(row["bytes_per_message"])))
     return [StoredTable("finetune", "Before and after fine-tuning", lines)]
 
@@ -241,6 +229,9 @@ _KINDS: tuple[tuple[Callable[[dict[str, Any]], bool], Callable[[dict[str, Any]],
     (lambda result: "stats" in result and "rows" in result, _make_evaluation),
     (lambda result: "cpu_minutes" in result and "rows" in result, _make_finetune),
     (_has_no_recording, _make_speed),
+    (lambda result: result.get("study") == "main-table", make_main_tables),
+    (lambda result: result.get("study") == "robustness", make_robustness_tables),
+    (lambda result: "study" in result and "tables" in result, make_printed_tables),
 )
 
 

@@ -22,6 +22,17 @@ NOT_RUN, TERMINAL_WIDTH = "not run", 80
 LOG2_BYTES, DATA_AGE, AP_DIFFERENCE = "log2(bytes)", "data age [ms]", "ΔAP [95 % CI]"
 AP_CROSSING, AP_DIVIDER, AP_BOUNDARY = "AP crossing", "AP divider", "AP boundary"
 
+Lines = list[tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class StoredTable:
+    """A table of a document. name: by which a marker selects it; lines: headings first."""
+
+    name: str
+    title: str
+    lines: Lines
+
 
 @dataclass(frozen=True)
 class MethodRow:

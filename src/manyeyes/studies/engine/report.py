@@ -59,7 +59,7 @@ class StudyContext:
         Args:
             title: of tables and documents.
             payload: the results, for JSON.
-            tables: for the terminal and the document.
+            tables: for the terminal, the document and JSON.
             save_picture: draws the picture to a path; None: there is none.
             notes: lines below the tables.
             config: what else the provenance names, beside the options.
@@ -73,7 +73,7 @@ class StudyContext:
             self.console.print()
         for note in notes:
             self.print(note)
-        result = {"study": name, "title": title, "missing": self.missing, **payload}
+        result = {"study": name, "title": title, "missing": self.missing, **payload, "tables": tables}
         provenance.write_json(out / f"{name}.json", result, {"options": self.options, "config": config}, self.seed)
         text = [f"# {name}\n\n{title}\n", *map(format_markdown, tables), *(f"{note}\n" for note in notes)]
         if save_picture is not None:
