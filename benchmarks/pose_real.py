@@ -2,7 +2,7 @@
 """Acceptance of pose correction on boxes with the errors measured on real boxes (simulator/fleet/landmarks.py).
 
 Tables: ``answers``: true scenes without a prior, by density and common objects. ``nulls``: agents without common objects, and at
-one place minutes apart. ``clutter``: 150 false boxes that are fixed to the sensors, 15 true ones, an exact prior; and honest pairs of
+one place minutes apart. ``clutter``: 150 false boxes that are fixed to the sensors, 15 true ones, an exact prior; and pairs of
 vehicles beside and ahead of each other. ``body``: two vehicles whose middles are up to 2 m from the origins of their frames.
 
 Every line states a rate with its one-sided 95 % bound (Clopper-Pearson) and its target. Constants were chosen on seed 101; this

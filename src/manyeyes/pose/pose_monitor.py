@@ -3,9 +3,10 @@
 
 The monitored quantity is the innovation: the pose measured from objects less the prior, in the axes of the prior's
 covariance. One frame is tested by chi^2. A lasting offset, too small to fail in single frames, is tested by chi^2 of the mean
-over the last frames. A drift is the slope of a line that is level up to some frame and rises after it, so that a constant
-error of the prior does not hide it. Earlier frames fix the level, so that a drift is detected sooner than from its own frames
-alone. Pure functions: the state belongs to the caller.
+over the last frames. A drift is a line that is level up to some frame and rises after it (drift_test.py), so that a constant error
+of the prior does not hide it. Earlier frames fix the level, so that a drift is detected sooner than from its own frames alone.
+Errors of successive frames are correlated; the correlation is estimated with the drift, and the mean over n frames counts as
+n (1 - r) / (1 + r) independent ones. Pure functions: the state belongs to the caller.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.pose.corrector import CHI2_3DOF_P001, CHI2_3DOF_P05
+from manyeyes.pose.drift_test import find_drift
 from manyeyes.pose.types import PoseEstimate, PosePrior, pose_difference
 
 Floats = NDArray[np.float64]
@@ -38,16 +40,17 @@ class PoseHealth(Enum):
 @dataclass(frozen=True)
 class PoseMonitorConfig:
     """max_frames: measured frames in memory. offset_window: frames over which an offset is averaged. min_drift_frames: frames that
-    a drift needs. offset_gate, suspect_gate: limits of squared distances, 16.27 is p = 0.001 of one frame. drift_gate_sigmas:
-    limit of the slope; at 4.5, fewer than one sound agent in twenty is reported in half a minute at 10 Hz.
+    a drift lasts at least; twice as many are measured before it is tested. offset_gate, suspect_gate: limits of squared distances,
+    16.27 is p = 0.001 of one frame. drift_gate_sigmas: limit of the drift; at 4.9, fewer than one sound agent in a hundred is
+    reported in half a minute at 10 Hz, whatever the autocorrelation of its errors (benchmarks/pose_drift.py).
     """
 
-    max_frames: int = 100
+    max_frames: int = 200
     offset_window: int = 30
-    min_drift_frames: int = 20
+    min_drift_frames: int = 10
     offset_gate: float = CHI2_3DOF_P001
     suspect_gate: float = CHI2_3DOF_P05
-    drift_gate_sigmas: float = 4.5
+    drift_gate_sigmas: float = 4.9
 
     def __post_init__(self) -> None:
         fits = 3 <= self.min_drift_frames <= self.max_frames and 1 <= self.offset_window <= self.max_frames
@@ -78,6 +81,7 @@ class PoseMonitorState:
 class PoseReport:
     """The health and its statistics. mahalanobis_squared: the larger of the last and the mean innovation's. drift_per_s: (3,)
     metres and radians per second; drift_sigmas: its size in standard deviations; num_frames: measured frames in memory.
+    autocorrelation: of the innovations of successive frames, NaN before it is estimated.
     """
 
     health: PoseHealth
@@ -85,6 +89,7 @@ class PoseReport:
     drift_per_s: Floats
     drift_sigmas: float
     num_frames: int
+    autocorrelation: float = float("nan")
 
 
 def update_monitor(
@@ -115,40 +120,25 @@ def _report(state: PoseMonitorState, config: PoseMonitorConfig) -> PoseReport:
     n = len(state.time_s)
     if not n:
         return PoseReport(PoseHealth.UNKNOWN, float("nan"), np.zeros(3), 0.0, 0)
-    drift, sigmas = _slope(state, config.min_drift_frames) if n >= config.min_drift_frames else (np.zeros(3), 0.0)
+    stated = np.diagonal(state.measured_covariance, axis1=1, axis2=2).mean(0)
+    drift, sigmas, correlation = np.zeros(3), 0.0, float("nan")
+    if n >= max(2 * config.min_drift_frames, 3):
+        found = find_drift(state.innovation, state.time_s, stated, config.min_drift_frames)
+        drift, sigmas, correlation = found.slope, float(found.sigmas), float(found.correlation)
     now = _distance(state.innovation[-1], state.measured_covariance[-1] + state.prior_covariance[-1])
     # The prior's error may be common to all frames, so that only the measurements average out.
     weight = np.linalg.inv(state.measured_covariance[-config.offset_window :])
     joint = np.linalg.inv(weight.sum(0))
     mean = joint @ np.einsum("nab,nb->a", weight, state.innovation[-config.offset_window :])
+    if n >= max(2 * config.min_drift_frames, 3):
+        joint = joint * min((1 + correlation) / (1 - correlation), len(weight))
     mean_distance = _distance(mean, joint + state.prior_covariance[-config.offset_window :].mean(0))
     health = PoseHealth.SUSPECT if now > config.suspect_gate else PoseHealth.SOUND
     if max(now, mean_distance) > config.offset_gate:
         health = PoseHealth.OFFSET
     if sigmas > config.drift_gate_sigmas:
         health = PoseHealth.DRIFTING
-    return PoseReport(health, max(now, mean_distance), drift, sigmas, n)
-
-
-def _slope(state: PoseMonitorState, min_frames: int) -> tuple[Floats, float]:
-    """Fit a line through the innovations that is level and then rises over at least min_frames.
-
-    Returns its slope (3,) per second, and the larger significance of translation and yaw in standard deviations. The spread is the
-    larger of the stated and the observed one, so that independent prior errors in each frame do not appear as a drift.
-    """
-    n = len(state.time_s)
-    begins = state.time_s[: n - min_frames + 1]
-    rising = np.maximum(state.time_s - begins[:, None], 0.0)
-    rising -= rising.mean(1, keepdims=True)
-    span = np.square(rising).sum(1, keepdims=True)
-    slope = rising @ state.innovation / span
-    whole = np.square(state.innovation - state.innovation.mean(0)).sum(0)
-    shown = (whole - np.square(slope) * span) / (n - 2)
-    stated = np.diagonal(state.measured_covariance, axis1=1, axis2=2).mean(0)
-    squared = np.square(slope) * span / np.maximum(shown, stated)
-    sigmas = np.sqrt(np.maximum(squared[:, 0] + squared[:, 1], squared[:, 2]))
-    best = int(sigmas.argmax())
-    return slope[best], float(sigmas[best])
+    return PoseReport(health, max(now, mean_distance), drift, sigmas, n, correlation)
 
 
 def _distance(delta: Floats, covariance: Floats) -> float:
