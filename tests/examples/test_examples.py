@@ -150,3 +150,12 @@ def test_11_live_agents(tmp_path: Path) -> None:
     rows = sorted(run("11_live_agents.py", str(tmp_path / "keys")).strip().splitlines())
     assert [row.partition(":")[0] for row in rows] == ["agent 1", "agent 2"]
     assert all(row.endswith("[(10, 0), (20, 4)]") for row in rows)
+
+
+@pytest.mark.slow
+def test_12_correct_pose(tmp_path: Path) -> None:
+    picture = tmp_path / "pose.png"
+    status, accuracy, _, _ = run("12_correct_pose.py", str(picture)).strip().splitlines()
+    assert int(status.split()[1]) >= 7 and status.endswith("common objects")
+    assert float(accuracy.split()[2]) < 0.5
+    assert picture.stat().st_size > 5_000

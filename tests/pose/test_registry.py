@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import manyeyes
 from manyeyes.datatypes import ConfigError, ShapeError
+from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.registry import (
     POSE_CORRECTORS,
     correct_pose,
@@ -46,6 +48,32 @@ def test_boxes_as_arrays_give_the_pose(prior) -> None:
     estimate = correct_pose(observe_from(np.zeros(3)), observe_from(POSE).tolist(), prior)
     assert estimate.status.has_estimate and estimate.inliers == 6
     np.testing.assert_allclose(estimate.measured, POSE, atol=1e-6)
+
+
+def test_planar_rows_with_scores_and_a_prior_with_a_covariance_give_the_same_pose() -> None:
+    ego, other = (boxes[:, [0, 1, 6, 3, 4, 6]] for boxes in (observe_from(np.zeros(3)), observe_from(POSE)))
+    ego[:, 5], other[:, 5] = 0.9, 0.8
+    covariance = np.array([[0.25, 0.1, 0.0], [0.1, 0.25, 0.0], [0.0, 0.0, 0.0025]])
+    estimate = manyeyes.correct_pose(
+        ego, other.tolist(), manyeyes.PosePrior.from_pose(POSE + [0.3, 0.2, 0.01], covariance)
+    )
+    assert estimate.status is PoseStatus.OK and estimate.inliers == 6 and estimate.covariance.shape == (3, 3)
+    np.testing.assert_allclose(estimate.measured, POSE, atol=1e-6)
+    assert (Landmarks.of(ego).score == 0.9).all()
+    by_volume = correct_pose(observe_from(np.zeros(3)), observe_from(POSE))
+    np.testing.assert_allclose(correct_pose(ego, other).pose, by_volume.pose, atol=1e-9)
+    with pytest.raises(ShapeError, match=r"covariance \(3, 3\)"):
+        PosePrior.from_pose(POSE, np.zeros(3))
+
+
+def test_states_without_a_measured_pose_keep_the_prior_or_give_none() -> None:
+    ego, strangers = observe_from(np.zeros(3)), observe_from(POSE)[:1]
+    assert correct_pose(ego, strangers).status is PoseStatus.NO_MATCH and correct_pose(ego, strangers).pose is None
+    prior = PosePrior.of([1.0, 2.0, 0.5], 1.0, 0.1)
+    kept = correct_pose(ego, np.zeros((0, 6)), prior)
+    assert kept.status is PoseStatus.NO_MATCH and kept.inliers == 0 and kept.measured is None
+    np.testing.assert_allclose(kept.pose, prior.pose)
+    np.testing.assert_allclose(kept.covariance, prior.covariance)
 
 
 def test_another_corrector_takes_the_same_arrays() -> None:

@@ -80,7 +80,8 @@ class Landmarks:
 
     @classmethod
     def of(cls, objects: Landmarks | Boxes | Numbers) -> Landmarks:
-        """Return landmarks of boxes, or of an array (N, 7) of their centre x, y, z and length, width, height (m) and yaw (rad).
+        """Return landmarks of boxes, or of an array: (N, 7) centre x, y, z, length, width, height (m) and yaw (rad), or (N, 6) x, y
+        (m), yaw (rad), length, width (m) and score. Boxes of arrays get the errors of DetectorUncertainty.
 
         Raises:
             ShapeError: the array has another shape.
@@ -89,11 +90,14 @@ class Landmarks:
             return objects
         if not isinstance(objects, Boxes):
             rows = as_tensor(objects, "Landmarks.of", torch.float64)
-            if rows.ndim != 2 or rows.shape[1] != 7:
+            if rows.ndim != 2 or rows.shape[1] not in (6, 7):
                 raise ShapeError(
-                    f"Landmarks.of needs boxes (N, 7): x, y, z, length, width, height, yaw; got {tuple(rows.shape)}."
+                    "Landmarks.of needs boxes (N, 7): x, y, z, length, width, height, yaw; "
+                    f"or (N, 6): x, y, yaw, length, width, score; got {tuple(rows.shape)}."
                 )
-            objects = Boxes.of(rows[:, :3], rows[:, 3:6], rows[:, 6])
+            objects = (
+                Boxes.of(rows[:, :3], rows[:, 3:6], rows[:, 6]) if rows.shape[1] == 7 else _boxes_of_planar_rows(rows)
+            )
         return cls.of_boxes(objects)
 
     @classmethod
@@ -195,6 +199,13 @@ class Landmarks:
     def _select_best(self, rows: Ints, max_count: int) -> Ints:
         """Return positions in rows of the highest scores, in the order of rows."""
         return np.sort(np.argsort(-self.score[rows], kind="stable")[:max_count])
+
+
+def _boxes_of_planar_rows(rows: torch.Tensor) -> Boxes:
+    """Return boxes on the ground of rows (N, 6): x, y, yaw, length, width, score."""
+    flat = torch.zeros(len(rows), 1, dtype=rows.dtype)
+    boxes = Boxes.of(torch.cat((rows[:, :2], flat), 1), torch.cat((rows[:, 3:5], flat + 1.0), 1), rows[:, 2])
+    return replace(boxes, score=rows[:, 5])
 
 
 def _concatenate(column: Sequence[Any]) -> Any:

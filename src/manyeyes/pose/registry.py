@@ -124,13 +124,15 @@ def correct_pose(
     """Estimate ego_from_other, the other agent's pose in the ego's frame, from what both observe at one instant.
 
     Args:
-        ego, other: each in its own frame: boxes, or an array (N, 7) of their centre x, y, z and length, width, height (m) and yaw
-            (rad). For a corrector of clouds: clouds, or arrays (N, 3), metres.
-        prior: what is known of the pose before; see ``PosePrior.of``.
+        ego, other: each in its own frame: boxes, or an array (N, 6) of their x, y (m), yaw (rad), length, width (m) and score, or
+            (N, 7) of their centre x, y, z and length, width, height (m) and yaw (rad). For a corrector of clouds: clouds, or arrays
+            (N, 3), metres.
+        prior: what is known of the pose before; see ``PosePrior.of`` and ``PosePrior.from_pose``.
         corrector: a registered name.
 
     Returns:
-        The pose to use with its covariance, and the status of the comparison with the prior.
+        The pose to use with its covariance, the pairs of boxes, and the status: AMBIGUOUS and NO_MATCH are not measured, and their
+        pose is the prior or None (docs/pose/index.md).
 
     Raises:
         ConfigError: the corrector is not known. ShapeError: an array has another shape.

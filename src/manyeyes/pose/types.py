@@ -65,12 +65,19 @@ class PosePrior:
         Raises:
             ShapeError: the pose is neither. ConfigError: a value is not finite.
         """
-        if not isinstance(ego_from_other, Transform):
-            pose = as_tensor(ego_from_other, "PosePrior.of", torch.float64)
-            if pose.shape != (3,):
-                raise ShapeError(f"PosePrior.of needs a transform, or x, y and yaw (3,); got {tuple(pose.shape)}.")
-            ego_from_other = Transform.from_xyz_yaw(float(pose[0]), float(pose[1]), 0.0, float(pose[2]))
-        return cls(ego_from_other, np.diag([sigma_xy_m**2, sigma_xy_m**2, sigma_yaw_rad**2]))
+        return cls(
+            _as_transform(ego_from_other, "PosePrior.of"), np.diag([sigma_xy_m**2, sigma_xy_m**2, sigma_yaw_rad**2])
+        )
+
+    @classmethod
+    def from_pose(cls, ego_from_other: Transform | Numbers, covariance: Numbers) -> PosePrior:
+        """Return a prior of a transform, or of x, y (m) and yaw (rad), with a covariance (3, 3) of these in the ego's axes.
+
+        Raises:
+            ShapeError: the pose is neither, or the covariance has another shape. ConfigError: a value is not finite.
+        """
+        spread = as_tensor(covariance, "PosePrior.from_pose", torch.float64).numpy()
+        return cls(_as_transform(ego_from_other, "PosePrior.from_pose"), spread)
 
     @classmethod
     def between(cls, ego: AgentFrame | Message, other: AgentFrame | Message) -> PosePrior:
@@ -123,6 +130,16 @@ class PoseCorrector(Protocol):
     def __call__(self, ego: Landmarks, other: Landmarks, prior: PosePrior | None) -> PoseEstimate:
         """Estimate ego_from_other from both agents' landmarks and an optional prior."""
         ...
+
+
+def _as_transform(pose: Transform | Numbers, name: str) -> Transform:
+    """Return a transform, or the planar one of x, y (m) and yaw (rad)."""
+    if isinstance(pose, Transform):
+        return pose
+    numbers = as_tensor(pose, name, torch.float64)
+    if numbers.shape != (3,):
+        raise ShapeError(f"{name} needs a transform, or x, y and yaw (3,); got {tuple(numbers.shape)}.")
+    return Transform.from_xyz_yaw(float(numbers[0]), float(numbers[1]), 0.0, float(numbers[2]))
 
 
 def project_to_se2(transform: Transform) -> Floats:
