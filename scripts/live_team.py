@@ -49,6 +49,7 @@ class TeamConfig:
     weights: str | None = None
     recording: tuple[str, str] | None = None
     plan: FaultPlan = field(default_factory=FaultPlan)
+    start_ns: int = field(default_factory=read_tai_ns)
 
 
 @dataclass(frozen=True)
@@ -159,7 +160,8 @@ def run_agent(config: TeamConfig, agent_id: int, port: int, pipe: Connection) ->
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     control = _Control(pipe)
-    clock = LiveClock(rate=config.rate, reference=control.reference_ns)
+    # In slow motion, all clocks count from one start.
+    clock = LiveClock(config.start_ns, config.rate, control.reference_ns)
     if config.weights is None:
         agent = Agent(OneCar(), get_strategy("late"))
     else:

@@ -139,6 +139,22 @@ def test_presence_is_asked_of_the_network_and_ids_change(join: Join) -> None:
     assert [p.origin.link for p in collect(a, 1)] == ["77"]
 
 
+@pytest.mark.parametrize("join", ["zenoh"], indirect=True)
+def test_clocks_of_others_are_asked_for(join: Join) -> None:
+    """The clock of agent 2 is 0.3 s ahead: within half of the round trip."""
+    a, b = join(), join()
+    assert isinstance(a, ZenohNetwork) and isinstance(b, ZenohNetwork)
+    settle((a, b), (HERE, HERE))
+    b._clock = lambda: time.time_ns() + 300_000_000
+    until = time.monotonic() + 2 * WAIT_S
+    while not (found := a.clock_offsets()) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert list(found) == ["2"]
+    assert abs(found["2"].offset_ns - 300_000_000) <= found["2"].sigma_ns + 1_000_000
+    b.rename(77)
+    assert b.clock_offsets() == {}
+
+
 def test_what_cannot_be_used_is_one_error() -> None:
     with pytest.raises(ConfigError, match=r"203\.0\.113\.7"):
         UdpNetwork(UdpConfig(interface="203.0.113.7"), time.time_ns)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Network by zenoh (https://zenoh.io): peers that find each other by seeds and gossip, or by multicast.
 
-Keys are ``manyeyes/NETWORK/3/TILE/AGENT/msg``, and ``manyeyes/NETWORK/3/live/AGENT`` for the presence of an agent. Packets are sent
+Keys are ``manyeyes/NETWORK/3/TILE/AGENT/msg``, ``manyeyes/NETWORK/3/live/AGENT`` for the presence of an agent, and
+``manyeyes/NETWORK/3/clock/AGENT``, which answers a query with the agent's time. Packets are sent
 best-effort and are dropped under congestion. The callback of a subscription only appends to a bounded buffer: a callback that works
 makes zenoh queue without a bound.
 """
@@ -10,20 +11,26 @@ from __future__ import annotations
 
 import json
 import re
+import struct
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from manyeyes.comms.network.interface import Origin, ReceivedPacket
-from manyeyes.comms.network.link_rings import MAX_PACKET_BYTES, LinkRings
+from manyeyes.comms.network.link_rings import MAX_LINKS, MAX_PACKET_BYTES, LinkRings
 from manyeyes.comms.network.tiles import NetworkTile
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.extras import import_extra
+from manyeyes.runtime.sender_clocks import ClockOffset, TwoWayClock
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 LEASE_MS = 1_000
 """A process that does not answer for this long is gone."""
 MAX_SESSIONS = 128
+QUERY_PERIOD_NS, QUERY_TIMEOUT_S = 1_000_000_000, 1.0
+_TIMES = struct.Struct("<qq")
 
 
 @dataclass(frozen=True)
@@ -48,6 +55,8 @@ class ZenohNetwork:
         MissingExtraError: zenoh is not installed.
     """
 
+    _queried_ns: int | None
+
     def __init__(self, config: ZenohConfig, agent_id: int, clock: Callable[[], int]) -> None:
         if not _NAME.fullmatch(config.network):
             raise ConfigError(f"A network is named by letters, digits, - and _; got {config.network!r}.")
@@ -55,11 +64,13 @@ class ZenohNetwork:
         self._prefix, self._agent_id = f"manyeyes/{config.network}/3", agent_id
         self._rings = LinkRings(clock)
         self._tile: NetworkTile | None = None
+        self._clock, self._offsets, self._queried_ns = clock, OrderedDict[str, TwoWayClock](), None
         self._subscriptions: dict[NetworkTile, Any] = {}
         self._publisher: Any = None
         try:
             self._session = self._zenoh.open(self._make_config(config))
             self._token = self._session.liveliness().declare_token(f"{self._prefix}/live/{agent_id}")
+            self._queryable = self._declare_clock()
         except self._zenoh.ZError as error:
             raise ConfigError(f"zenoh, listening on {', '.join(config.listen)}: {error}") from error
 
@@ -115,6 +126,40 @@ class ZenohNetwork:
             self._agent_id, self._tile = agent_id, None
             self._token.undeclare()
             self._token = self._session.liveliness().declare_token(f"{self._prefix}/live/{agent_id}")
+            self._queryable.undeclare()
+            self._queryable = self._declare_clock()
+            self._offsets.clear()
+
+    def clock_offsets(self) -> dict[str, ClockOffset]:
+        """Return the clocks of others less the own one, by the ids that they state; other agents are asked once a second.
+
+        Answers are not authenticated: they inform displays, and exclude no sender.
+        """
+        now_ns = self._clock()
+        if self._queried_ns is None or now_ns - self._queried_ns >= QUERY_PERIOD_NS:
+            self._queried_ns = now_ns
+            self._session.get(f"{self._prefix}/clock/*", partial(self._take_time, now_ns), timeout=QUERY_TIMEOUT_S)
+        estimates = {agent: clock.estimate() for agent, clock in list(self._offsets.items())}
+        return {agent: one for agent, one in estimates.items() if one is not None}
+
+    def _declare_clock(self) -> Any:
+        key = f"{self._prefix}/clock/{self._agent_id}"
+
+        def answer(query: Any) -> None:
+            query.reply(key, _TIMES.pack(now_ns := self._clock(), max(now_ns, self._clock())))
+
+        return self._session.declare_queryable(key, answer)
+
+    def _take_time(self, sent_ns: int, reply: Any) -> None:
+        """Record an answer, of at most MAX_LINKS agents."""
+        received_ns = self._clock()
+        if reply.ok is None or len(reply.ok.payload) != _TIMES.size:
+            return
+        agent = str(reply.ok.key_expr).rpartition("/")[2]
+        if agent == str(self._agent_id) or (agent not in self._offsets and len(self._offsets) >= MAX_LINKS):
+            return
+        there_ns, answered_ns = _TIMES.unpack(reply.ok.payload.to_bytes())
+        self._offsets.setdefault(agent, TwoWayClock()).add(sent_ns, there_ns, answered_ns, received_ns)
 
     def close(self) -> None:
         """Undeclare everything and close the session."""
