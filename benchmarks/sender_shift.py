@@ -38,17 +38,17 @@ LEVELS: tuple[tuple[float, NoiseInTime], ...] = (
 def describe(
     condition: dict[str, Any], config: BenchmarkConfig, results: dict[str, MethodResult]
 ) -> list[dict[str, Any]]:
-    """One row a method, with its difference to plain intermediate fusion of the same form."""
+    """One row a method, with its difference to plain intermediate fusion and to the ego alone, of the same form."""
     protocol, rows = resolve_protocol(config), []
     for name, result in results.items():
-        row = {**condition, "method": name}
-        base = "intermediate-temporal" if name.endswith("-temporal") else "intermediate"
+        row, form = {**condition, "method": name}, "-temporal" if name.endswith("-temporal") else ""
         for column, iou in enumerate(IOU_THRESHOLDS):
             interval = result.intervals[column]
             row[f"ap@{iou:g}"] = [interval.value, interval.low, interval.high]
-            if name != base:
-                gain = result.paired_difference(results[base], column, protocol)
-                row[f"difference@{iou:g}"] = [gain.value, gain.low, gain.high]
+            for base in (f"intermediate{form}", f"no-fusion{form}"):
+                if base in results and name != base:
+                    gain = result.paired_difference(results[base], column, protocol)
+                    row[f"less {base} @{iou:g}"] = [gain.value, gain.low, gain.high]
         rows.append(row)
     return rows
 
@@ -62,13 +62,14 @@ def main() -> None:
     parser.add_argument("--weights", default="costr-small")
     parser.add_argument("--correctors", nargs="*", default=["off", "voting"])
     parser.add_argument("--methods", nargs="*", default=METHODS)
+    parser.add_argument("--sigmas", nargs="*", type=float, default=[0.0, 0.4, 0.8])
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
     opening = partial(open_recording, given.data, given.split)
     conditions, configs = [], []
     for corrector in given.correctors:
         correction = None if corrector == "off" else PoseCorrection(corrector)
-        for sigma_m, in_time in LEVELS:
+        for sigma_m, in_time in [level for level in LEVELS if level[0] in given.sigmas]:
             noise = PoseNoise(in_time=in_time).at_level(sigma_m, 0.0)
             replay = ReplayConfig(warmup_frames=given.warmup, pose_correction=correction)
             drift = OdometryDrift()
