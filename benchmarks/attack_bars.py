@@ -77,9 +77,7 @@ def measure_attacks(rows: list[dict[str, Any]]) -> Iterator[Measured]:
             yield _proportion("5", f"{name}: named within 10 frames", row["named"][1], MIN_NAMED_COLLUDING)
         surviving = row["blind"]["surviving"]
         if surviving["successes"]:
-            yield _proportion(
-                "4", f"{name}: surviving uncheckable claims with stated evidence", row["blind"]["marked"], 1.0
-            )
+            yield _proportion("4", f"{name}: surviving uncheckable claims marked as such", row["blind"]["marked"], 1.0)
             yield _proportion("4", f"{name}: those of senders with trust >= 0.8", row["blind"]["trusted"], 1.0)
 
 

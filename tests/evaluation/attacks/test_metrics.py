@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 
+from manyeyes.agents.trust.interface import Evidence
 from manyeyes.evaluation.attacks.metrics import (
     EventRate,
     Proportion,
@@ -15,7 +16,7 @@ from manyeyes.evaluation.attacks.metrics import (
     measure_survival,
     times_to_detection,
 )
-from manyeyes.evaluation.attacks.records import NO_EVIDENCE, ClaimRecord, DriveRecord, SenderRecord
+from manyeyes.evaluation.attacks.records import ClaimRecord, DriveRecord, SenderRecord
 from manyeyes.evaluation.attacks.removed_objects import count_removed
 from manyeyes.evaluation.detection.frame_match import FrameMatch
 
@@ -26,11 +27,13 @@ def sender(number: int, malicious: bool, named: list[int], trust: list[float] | 
     return SenderRecord(0, number, malicious, received, values, torch.tensor(named, dtype=torch.bool))
 
 
-def claim(rays: list[int], score: list[float], near_real: bool = False, evidence: int = 0) -> ClaimRecord:
+def claim(
+    rays: list[int], score: list[float], near_real: bool = False, evidence: Evidence = Evidence.UNCHECKED
+) -> ClaimRecord:
     n = len(rays)
     return ClaimRecord(
         0, 2, 0, near_real, torch.ones(n, dtype=torch.bool), torch.tensor(rays), torch.tensor(score).double(),
-        torch.full((n,), evidence), torch.full((n,), 0.9).double(),
+        torch.full((n,), int(evidence)), torch.full((n,), 0.9).double(),
     )  # fmt: skip
 
 
@@ -71,7 +74,10 @@ def test_only_senders_with_a_checkable_claim_are_selected() -> None:
 
 def test_survival_splits_checkable_from_blind_claims() -> None:
     drives = [
-        drive((), (claim([12, 12, 12], [0.6, 0.4, 0.5]), claim([0, 0, 0], [0.9, 0.9, 0.0], evidence=NO_EVIDENCE)))
+        drive(
+            (),
+            (claim([12, 12, 12], [0.6, 0.4, 0.5]), claim([0, 0, 0], [0.9, 0.9, 0.0], evidence=Evidence.CORROBORATED)),
+        )
     ]
     seen, blind = (measure_survival(drives, checkable) for checkable in (True, False))
     assert (seen.surviving.successes, seen.surviving.total, seen.marked.successes) == (2, 3, 2)

@@ -92,8 +92,8 @@ def test_own_detections_are_never_displaced(detector, cache, method, name) -> No
 def test_the_oracle_is_the_run_without_the_messages_of_malicious_agents(detector, cache) -> None:
     dropped = play(detector, cache, DriveSetting("late", CONFIG, ROLES, GhostAttack(3), drops_malicious=True))
     assert [r.message.agent_id for r in dropped[-1].step.perception.received] == [7, 8]
-    told = replace(CONFIG, misbehaviour=get_misbehaviour_detector("none"))
-    undefended = play(detector, cache, DriveSetting("late", told, ROLES, GhostAttack(3)))
+    defended = replace(CONFIG, misbehaviour=get_misbehaviour_detector("none"))
+    undefended = play(detector, cache, DriveSetting("late", defended, ROLES, GhostAttack(3)))
     assert [r.message.agent_id for r in undefended[-1].step.perception.received] == [6, 7, 8]
 
 

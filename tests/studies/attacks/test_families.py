@@ -18,7 +18,6 @@ from tests.studies.attacks.cases import (
 )
 
 from manyeyes.datatypes import ConfigError, Message
-from manyeyes.models.detector.box_head import BOX_LAYOUT
 from manyeyes.models.detector.proposal import PROPOSAL_DIM, proposed_heat, proposed_velocity
 from manyeyes.studies.attacks.catalog import ATTACKS, get_attack
 from manyeyes.studies.attacks.families.alternation import OnOffAttack
@@ -258,7 +257,3 @@ def test_every_attack_keeps_the_header_and_never_raises(name: str) -> None:
 def test_an_unknown_attack_lists_the_known_ones() -> None:
     with pytest.raises(ConfigError, match="known: ghost-1-seen"):
         get_attack("none-such")
-
-
-def test_proposals_have_the_columns_that_edits_assume() -> None:
-    assert BOX_LAYOUT.heatmap_logit == slice(0, 1)

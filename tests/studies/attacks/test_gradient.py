@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """White-box attacks on features: the gradient lowers the score of what honest agents find, within its bounds."""
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -75,3 +76,19 @@ def test_no_step_that_raises_the_loss_is_sent(view, monkeypatch) -> None:
     honest = view.message.tokens.features
     rows = perturb(view, GradientAttack(2, 1.0), torch.ones_like(honest[:, :-PROPOSAL_DIM]))
     assert torch.equal(rows, honest)
+
+
+def test_the_weight_of_the_defence_lowers_what_the_attacker_reaches(view, monkeypatch) -> None:
+    """At the lowest weight its tokens decide nothing where others have tokens too: the loss differs less from the honest one."""
+    monkeypatch.setattr("manyeyes.studies.attacks.families.gradient.TARGET_SCORE", 0.05)
+    honest = view.message.tokens.features[:, :-PROPOSAL_DIM]
+    changed = honest + 0.5 * honest.std(0, unbiased=False)
+    with torch.no_grad():
+        full, low = (
+            (
+                replace(view, log_weight=w).fuse(changed).heatmap_logit,
+                replace(view, log_weight=w).fuse(honest).heatmap_logit,
+            )
+            for w in (0.0, -4.0)
+        )
+    assert float((low[0] - low[1]).abs().sum()) < float((full[0] - full[1]).abs().sum())

@@ -2,7 +2,6 @@
 """The studies attacks and false-accusations from end to end, on small scenes, with weights that were never trained."""
 
 import json
-from pathlib import Path
 
 import pytest
 from tests.studies.attacks.scene import write_recording, write_weights
@@ -111,7 +110,3 @@ def test_drives_differ_and_their_length_is_the_stated_one() -> None:
 def test_names_of_conditions_are_unique() -> None:
     conditions = [AttackCondition(a, k, d) for a in (NO_ATTACK, "copy") for k in (1, 2) for d in (NO_DEFENCE, ORACLE)]
     assert len({condition.name for condition in conditions}) == len(conditions)
-
-
-def test_the_recording_of_the_scene_is_small(tmp_path: Path) -> None:
-    assert len(list(write_recording(tmp_path).rglob("*.pcd"))) == 2 * 6 * 4

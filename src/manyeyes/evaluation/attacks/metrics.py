@@ -22,11 +22,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import beta, chi2
 
-from manyeyes.evaluation.attacks.records import NO_EVIDENCE, ClaimRecord, DriveRecord, SenderRecord
+from manyeyes.agents.trust.interface import Evidence
+from manyeyes.evaluation.attacks.records import ClaimRecord, DriveRecord, SenderRecord
 from manyeyes.evaluation.attacks.sight import is_checkable
 
 CONFIDENCE_LEVEL = 0.95
-MIN_SCORE = 0.5
+MIN_SCORE, MIN_TRUST = 0.5, 0.8
+MARKED = (int(Evidence.UNCHECKED), int(Evidence.DISPUTED))
+"""Evidence that marks a box as one that nothing confirms."""
 FIRST_FRAMES = (5, 10)
 NUM_ROC_POINTS = 101
 
@@ -142,7 +145,7 @@ def is_claim_checkable(claim: ClaimRecord) -> bool:
 class Survival:
     """False claims on which a box of MIN_SCORE rests, of those sent, frame by frame; num_frames: evaluated with a false claim.
 
-    marked: of the surviving ones, with any evidence stated; trusted: of the surviving ones, of senders of at least MIN_TRUST.
+    marked: of the surviving ones, with evidence of MARKED; trusted: of the surviving ones, of senders of at least MIN_TRUST.
     """
 
     surviving: Proportion
@@ -156,9 +159,6 @@ class Survival:
         return self.surviving.successes / self.num_frames if self.num_frames else float("nan")
 
 
-MIN_TRUST = 0.8
-
-
 def measure_survival(drives: Sequence[DriveRecord], checkable: bool) -> Survival:
     """Return the survival of the checkable or of the other false claims; those near real objects are left out."""
     sent = surviving = marked = trusted = frames = 0
@@ -168,7 +168,7 @@ def measure_survival(drives: Sequence[DriveRecord], checkable: bool) -> Survival
             is_sent = claim.is_sent.numpy()
             survives = is_sent & (claim.score.numpy() >= MIN_SCORE)
             sent, surviving = sent + int(is_sent.sum()), surviving + int(survives.sum())
-            marked += int((survives & (claim.evidence.numpy() != NO_EVIDENCE)).sum())
+            marked += int((survives & np.isin(claim.evidence.numpy(), MARKED)).sum())
             trusted += int((survives & (claim.trust.numpy() >= MIN_TRUST)).sum())
         if claims:
             frames += int(np.any([claim.is_sent.numpy() for claim in claims], axis=0).sum())

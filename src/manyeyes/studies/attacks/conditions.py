@@ -103,7 +103,7 @@ class ScenarioPlayer:
 
     @classmethod
     def open(cls, job: AttackScenarioJob) -> ScenarioPlayer:
-        """Read a scenario."""
+        """Read the snapshots of a scenario."""
         recording, perturb = job.config.filter_recording(job.open_recording()), job.config.make_perturbation()
         indices = recording.eval_indices(job.scenario)
         first = max(0, indices.start - job.config.replay.warmup_frames)

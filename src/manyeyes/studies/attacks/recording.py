@@ -52,7 +52,7 @@ class DriveRecorder:
     _claims: dict[tuple[int, int], dict[int, ClaimFrame]] = field(default_factory=dict)
 
     def add(self, played: DriveStep) -> None:
-        """Record one frame."""
+        """Record one frame of the ego."""
         snapshot, perception, at = played.step.snapshot, played.step.perception, self.num_frames
         self.num_frames += 1
         for sender, row in find_sender_frames(perception).items():
@@ -141,14 +141,14 @@ def find_evidence(perception: Perception, row: int) -> int:
 
 def count_honest_rays(snapshot: Snapshot, world: Boxes, malicious: frozenset[int]) -> Tensor:
     """Return (N,) int64: rays that cross each box in the world, of the honest agent with most of them."""
-    most = torch.zeros(len(world), dtype=torch.int64)
+    num_rays = torch.zeros(len(world), dtype=torch.int64)
     for row, frame in enumerate(snapshot.frames):
         if frame.agent_id not in malicious:
             pose = snapshot.truth.world_from_agent[row] if snapshot.truth else frame.world_from_agent
-            most = torch.maximum(
-                most, torch.from_numpy(count_rays(frame, world.transform(pose.inverse())).num_crossing)
+            num_rays = torch.maximum(
+                num_rays, torch.from_numpy(count_rays(frame, world.transform(pose.inverse())).num_crossing)
             )
-    return most
+    return num_rays
 
 
 def _nearest(points: Tensor, xy: Tensor) -> Tensor:
