@@ -19,13 +19,15 @@ MAX_LOSS_TO_ORACLE, MAX_CLEAN_COST = 0.01, 0.003
 MIN_NAMED_5, MIN_NAMED_10, MIN_NAMED_SEEN = 0.95, 0.99, 0.80
 MAX_ACCUSATION_RATE, MIN_SENDER_MINUTES = 0.01, 300.0
 MIN_NAMED_COLLUDING = 0.80
+MIN_SCENARIOS = 10
+"""A difference of AP over fewer scenarios is inconclusive: their bootstrap has too few resamples."""
 COLLUDING, PERSISTENT_SEEN = ("collude-3",), ("ghost-1-seen", "ghost-3-seen", "ghost-10-seen")
 NO_ATTACK, NO_DEFENCE, ORACLE = "none", "none", "oracle"
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A quantity that a bar bounds: at least minimum, at most maximum. n: number of samples, in words."""
+    """A quantity that a bar bounds: at least minimum, at most maximum. n: number of samples, in words; has_enough: of them."""
 
     bar: str
     name: str
@@ -35,11 +37,12 @@ class Measured:
     n: str
     minimum: float = -math.inf
     maximum: float = math.inf
+    has_enough: bool = True
 
     @property
     def verdict(self) -> str:
         """Return met, not met or inconclusive."""
-        if any(map(math.isnan, (self.value, self.low, self.high))):
+        if not self.has_enough or any(map(math.isnan, (self.value, self.low, self.high))):
             return "inconclusive"
         if self.low >= self.minimum and self.high <= self.maximum:
             return "met"
@@ -55,7 +58,7 @@ def measure_attacks(rows: list[dict[str, Any]]) -> Iterator[Measured]:
     """Yield bars 1, 2, 4 and 5 of the rows of the study attacks."""
     for row in rows:
         name = f"{row['method']}, {row['attack']} x{row['num_malicious']}, {row['defence']}"
-        scenarios = f"{row['num_scenarios']} scenarios"
+        scenarios = row["num_scenarios"]
         if row["defence"] in (NO_DEFENCE, ORACLE):
             continue
         if row["attack"] == NO_ATTACK:
@@ -95,11 +98,12 @@ def measure_accusations(rows: list[dict[str, Any]]) -> Iterator[Measured]:
         )
 
 
-def _difference(bar: str, name: str, pair: list[dict[str, Any]] | None, n: str, minimum: float) -> Measured:
+def _difference(bar: str, name: str, pair: list[dict[str, Any]] | None, scenarios: int, minimum: float) -> Measured:
+    n, has_enough = f"{scenarios} scenarios", scenarios >= MIN_SCENARIOS
     if pair is None:
         return Measured(bar, f"{name}, AP@0.5", math.nan, math.nan, math.nan, n, minimum)
     values = [math.nan if pair[0][key] is None else pair[0][key] for key in ("value", "low", "high")]
-    return Measured(bar, f"{name}, AP@0.5", values[0], values[1], values[2], n, minimum)
+    return Measured(bar, f"{name}, AP@0.5", values[0], values[1], values[2], n, minimum, has_enough=has_enough)
 
 
 def _proportion(bar: str, name: str, stored: dict[str, Any], minimum: float) -> Measured:

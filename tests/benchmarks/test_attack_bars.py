@@ -58,3 +58,7 @@ def test_false_accusations_state_the_missing_minutes() -> None:
 
 def test_a_missing_value_is_inconclusive() -> None:
     assert Measured("1", "a", float("nan"), 0.0, 1.0, "0", minimum=0.0).verdict == "inconclusive"
+
+
+def test_two_scenarios_decide_no_difference() -> None:
+    assert {m.verdict for m in measure_attacks([row("copy", num_scenarios=2)])} == {"inconclusive"}
