@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo keeps what it has: a map that fails leaves the report of the detections on disk."""
+"""The demo plays methods of one form, and keeps what it has: a map that fails leaves the report of the detections on disk."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from manyeyes.cli import main as cli
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
+from manyeyes.studies.replay_options import ALL_METHODS
 
 
 @pytest.mark.slow
@@ -38,7 +39,12 @@ def test_a_map_that_cannot_be_written_leaves_the_report(tmp_path: Path, capsys: 
         "report.html",
         "results.json",
         "results.md",
-        "no-fusion.png",
-        "early.png",
+        "no-fusion-temporal.png",
+        "early-temporal.png",
     }
-    assert len(json.loads((out / "results.json").read_text())["result"]["rows"]) == 4
+    held = json.loads((out / "results.json").read_text())["result"]
+    assert [row["method"] for row in held["rows"]] == [f"{name}-temporal" for name in ALL_METHODS]
+    assert {d["description"] for d in held["differences"]} == {
+        f"intermediate-temporal - {name}-temporal" for name in ("no-fusion", "late", "early")
+    }
+    assert "no-fusion-temporal late-temporal intermediate-temporal early-temporal" in (out / "report.html").read_text()

@@ -2,8 +2,8 @@
 """Simulate a drive in a town outside the training data, replay it with every fusion method, and evaluate the result.
 
 Three connected vehicles and a roadside unit meet at a crossing with traffic, buildings and occlusion. Detections of no fusion,
-late, intermediate and early fusion are compared on the same channel. A map is built too: of the drive, where a map model ships;
-else of a crossroads by a simulated fleet.
+late, intermediate and early fusion, all with the same memory of two frames, are compared on the same channel; --methods selects
+others. A map is built too: of the drive, where a map model ships; else of a crossroads by a simulated fleet.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from manyeyes._bounds import Fraction, InputPath, OutputFolder, PositiveInt, Seed
 from manyeyes.datatypes import ConfigError
-from manyeyes.studies.replay_options import ReplayOptions, display_name, make_excerpt
+from manyeyes.studies.replay_options import WITH_MEMORY, ReplayOptions, display_name, make_excerpt
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -41,7 +41,9 @@ class Options:
     """Draw the animation of the drive."""
     min_score: Fraction | None = None
     """Detections below this score are not drawn; they count all the same. By default that of the weights; 0.4 if uncalibrated."""
-    replay_options: ReplayOptions = field(default_factory=lambda: ReplayOptions(channel="its-g5-27mbps"))
+    replay_options: ReplayOptions = field(
+        default_factory=lambda: ReplayOptions(methods=WITH_MEMORY, channel="its-g5-27mbps")
+    )
     """How agents collaborate."""
 
 
@@ -81,7 +83,7 @@ def _run_demo(options: Options) -> None:
         raise ConfigError(f"{folder}: the drive has no evaluated frame; remove the folder and run the demo again.")
     spec = ReportSpec(
         out=options.out,
-        title="manyeyes demo: one drive, four ways to collaborate",
+        title=f"manyeyes demo: one drive, {len(options.replay_options.methods)} methods",
         lead=f"Simulated in {town}, which the shipped weights never saw. All that passes between agents is bytes.",
         methods=options.replay_options.methods,
         replay=replay,
@@ -91,7 +93,8 @@ def _run_demo(options: Options) -> None:
         facts=(("Town", town),),
         commands=(
             f"manyeyes demo --seed {options.seed}",
-            f"manyeyes replay {folder} --split test",
+            f"manyeyes replay {folder} --split test --channel {options.replay_options.channel} --methods "
+            + " ".join(options.replay_options.methods),
             f"manyeyes view {folder} --split test --out drive.gif",
             f"manyeyes map fuse {options.out / 'map'}",
         ),

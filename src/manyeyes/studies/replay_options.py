@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from manyeyes.datatypes import Snapshot
 
 ALL_METHODS = ("no-fusion", "late", "intermediate", "early")
+WITH_MEMORY = tuple(name + TEMPORAL for name in ALL_METHODS)
+"""One form of all methods: comparisons are made within a form."""
 BOTH_FORMS = tuple(
     name + form for form in ("", TEMPORAL) for name in ("no-fusion", "late", "late-weighted", "intermediate", "early")
 )

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from manyeyes._io import atomic_write_text
 from manyeyes.agents.replay import ReplayConfig, ReplayStep, replay
+from manyeyes.agents.strategies.names import TEMPORAL
 from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.datasets.missing import NONE_MISSING, MissingFiles
 from manyeyes.datatypes import BevGrid, ConfigError
@@ -39,14 +40,14 @@ REPORT = "report.html"
 WIDTH, FILM_WIDTH, FILM_FRAME_MS = 1280, 800, 200
 TITLES = {
     "no-fusion": "No fusion",
-    "no-fusion-temporal": "No fusion, with memory",
+    "no-fusion-temporal": "No fusion, with the last two frames",
     "late": "Late fusion: boxes are shared",
-    "late-temporal": "Late fusion: boxes are shared and remembered",
+    "late-temporal": "Late fusion: boxes are shared, with the last two frames",
     "late-weighted": "Late fusion: boxes are shared and averaged",
     "intermediate": "Intermediate fusion: tokens are shared",
-    "intermediate-temporal": "Intermediate fusion: tokens are shared and remembered",
+    "intermediate-temporal": "Intermediate fusion: tokens are shared, with the last two frames",
     "early": "Early fusion: all points are shared",
-    "early-temporal": "Early fusion: all points are shared and remembered",
+    "early-temporal": "Early fusion: all points are shared, with the last two frames",
 }
 
 
@@ -164,9 +165,10 @@ def find_min_score(detector: BoxDetector, method: str, chosen: float | None = No
 
 
 def _select_animated(methods: Sequence[str]) -> tuple[str, ...]:
-    """Return the two methods whose difference is the point, or as many of them as were run."""
-    preferred = tuple(name for name in ("no-fusion", "intermediate") if name in methods)
-    return preferred or tuple(methods[:1])
+    """Return the two methods of one form whose difference is the point, or as many of them as were run."""
+    pairs = (("no-fusion" + form, "intermediate" + form) for form in ("", TEMPORAL))
+    chosen = [tuple(name for name in pair if name in methods) for pair in pairs]
+    return max(chosen, key=len) or tuple(methods[:1])
 
 
 def _draw_step(step: ReplayStep, grid: BevGrid, caption: str, min_score: float, width: int) -> Image:
