@@ -144,6 +144,12 @@ def test_10_own_data(tmp_path: Path) -> None:
     assert all(float(row.split()[1]) > 0.5 for row in rows)
 
 
+def test_12_false_claim(tmp_path: Path) -> None:
+    rows = run("12_false_claim.py", str(tmp_path / "claim.png")).strip().splitlines()
+    assert len(rows) == 3 and all("agent 1 normal" in row and "[(15, 2), (28, 11)]" in row for row in rows)
+    assert "agent 2 malicious" in rows[2] and (tmp_path / "claim.png").is_file()
+
+
 @pytest.mark.slow
 def test_11_live_agents(tmp_path: Path) -> None:
     pytest.importorskip("cryptography", reason="the 'live' extra is not installed")

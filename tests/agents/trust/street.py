@@ -11,7 +11,7 @@ Claims are made by hand; no network is involved.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -94,7 +94,7 @@ class Street:
         self.state, self.index = found.state, self.index + 1
         return found
 
-    def fused(self, claims: Mapping[int, Boxes], senders: Sequence[int] | frozenset[int]) -> Boxes:
+    def fused(self, claims: Mapping[int, Boxes], senders: Collection[int]) -> Boxes:
         """The boxes of the ego and of some senders, one at each place."""
         found = [self.own]
         for sender in sorted(senders):

@@ -58,7 +58,7 @@ def test_returns_of_an_undetected_car_support_a_claim(street):
     assert kinds(street.step({1: cars(SEEN)}), 1) == [Evidence.SUPPORTED]
 
 
-def test_low_scores_are_refuted_but_accuse_nobody(street):
+def test_low_scores_are_refuted_but_accuse_no_sender(street):
     found = street.run(10, {1: cars(FREE, score=0.45)})
     assert kinds(found, 1) == [Evidence.REFUTED]
     assert sender(found, 1).status is NORMAL and sender(found, 1).trust == pytest.approx(PRIOR)
@@ -79,18 +79,17 @@ def test_two_refuted_claims_name_a_trusted_sender_after_two_frames(street):
 
 
 def test_a_claim_that_flickers_is_one_claim(street):
-    for index in range(5):
-        found = street.step({1: cars(SEEN, SEEN_TOO, FREE) if index % 2 == 0 else HONEST})
-    assert sender(found, 1).status is MALICIOUS
+    found = [street.step({1: cars(SEEN, SEEN_TOO, FREE) if index % 2 == 0 else HONEST}) for index in range(5)]
+    assert sender(found[-1], 1).status is MALICIOUS
 
 
 def test_claims_at_ever_new_places_end_in_low_trust(street):
-    for index in range(12):
-        found = street.step({1: cars((10.0 + 4 * (index % 6), -6.0 - 3 * (index // 6)))})
-    assert sender(found, 1).weight == 0.0
+    places = [(10.0 + 4 * (index % 6), -6.0 - 3 * (index // 6)) for index in range(12)]
+    found = [street.step({1: cars(place)}) for place in places]
+    assert sender(found[-1], 1).weight == 0.0
 
 
-def test_where_two_trusted_views_contradict_each_other_nobody_loses_trust(street):
+def test_where_two_trusted_views_contradict_each_other_no_trust_changes(street):
     """Agents 1 and 2 detect a car that the rays of the ego pass through, as an attacker can arrange (TrustFlip)."""
     street.run(5, {1: HONEST, 2: HONEST})
     before = street.step({1: HONEST, 2: HONEST})

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from manyeyes.agents.trust.association import Floats, Rows, associate
 from manyeyes.agents.trust.interface import Evidence
 
-NUM_LOOKS = 5
+NUM_CHECKS = 5
 """Number of evidences that a track keeps, the last ones."""
-NO_LOOK = -1
+NO_CHECK = -1
 MAX_UNCLAIMED_NS = 1_000_000_000
 """A track that is not claimed for longer ends; until then a claim that flickers stays one track."""
 GATE_M = 2.0
@@ -28,13 +28,13 @@ MAX_TRACKS = 512
 class ClaimTracks:
     """Tracks of K claimed objects, in the ego's frame of the last update.
 
-    xy: (K, 2) metres; velocity: (K, 2) m/s. looks: (K, NUM_LOOKS) int8 of Evidence, newest first, NO_LOOK before the first.
+    xy: (K, 2) metres; velocity: (K, 2) m/s. checks: (K, NUM_CHECKS) int8 of Evidence, newest first, NO_CHECK before the first.
     score: (K,) of the last claim. claimed_ns, supported_ns, refuted_ns: (K,) times of the last claim and of evidence, 0 for never.
     """
 
     xy: Floats
     velocity: Floats
-    looks: NDArray[np.int8]
+    checks: NDArray[np.int8]
     score: Floats
     claimed_ns: Rows
     supported_ns: Rows
@@ -44,7 +44,7 @@ class ClaimTracks:
     def empty(cls) -> ClaimTracks:
         """Return an instance without tracks."""
         none, never = np.zeros((0, 2)), np.zeros(0, np.int64)
-        return cls(none, none, np.zeros((0, NUM_LOOKS), np.int8), np.zeros(0), never, never, never)
+        return cls(none, none, np.zeros((0, NUM_CHECKS), np.int8), np.zeros(0), never, never, never)
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -53,14 +53,14 @@ class ClaimTracks:
         return ClaimTracks(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
     def count(self, kind: Evidence) -> Rows:
-        """Return (K,) the number of looks of a kind."""
-        return (self.looks == kind).sum(1)
+        """Return (K,) the number of checks of a kind."""
+        return (self.checks == kind).sum(1)
 
 
 def move_tracks(tracks: ClaimTracks, rotation: Floats, shift: Floats, seconds: float) -> ClaimTracks:
     """Return the tracks in the ego's frame after its motion, rotation (2, 2) and shift (2,), and after their own."""
     xy = (tracks.xy + tracks.velocity * seconds) @ rotation.T + shift
-    fields = (tracks.looks, tracks.score, tracks.claimed_ns, tracks.supported_ns, tracks.refuted_ns)
+    fields = (tracks.checks, tracks.score, tracks.claimed_ns, tracks.supported_ns, tracks.refuted_ns)
     return ClaimTracks(xy, tracks.velocity @ rotation.T, *fields)
 
 
@@ -70,7 +70,7 @@ def find_tracks(tracks: ClaimTracks, xy: Floats, sigma_m: Floats) -> Rows:
 
 
 @dataclass(frozen=True)
-class ClaimLooks:
+class ClaimChecks:
     """What one frame shows of N claims: xy (N, 2), velocity (N, 2), score (N,), evidence (N,) uint8, and track (N,), -1 is new."""
 
     xy: Floats
@@ -80,27 +80,27 @@ class ClaimLooks:
     track: Rows
 
 
-def update_tracks(tracks: ClaimTracks, looks: ClaimLooks, now_ns: int) -> ClaimTracks:
+def update_tracks(tracks: ClaimTracks, checks: ClaimChecks, now_ns: int) -> ClaimTracks:
     """Return the tracks of the N claims, in their order, then those that are not claimed now and have not ended."""
-    is_known, before = looks.track >= 0, tracks[looks.track.clip(0)] if len(tracks) else None
-    shape = (len(looks.xy), NUM_LOOKS - 1)
-    history, supported, refuted = np.full(shape, NO_LOOK, np.int8), *np.zeros((2, len(looks.xy)), np.int64)
+    is_known, before = checks.track >= 0, tracks[checks.track.clip(0)] if len(tracks) else None
+    shape = (len(checks.xy), NUM_CHECKS - 1)
+    history, supported, refuted = np.full(shape, NO_CHECK, np.int8), *np.zeros((2, len(checks.xy)), np.int64)
     if before is not None:
-        history[is_known] = before.looks[is_known, :-1]
+        history[is_known] = before.checks[is_known, :-1]
         supported[is_known], refuted[is_known] = before.supported_ns[is_known], before.refuted_ns[is_known]
-    supported[looks.evidence == Evidence.SUPPORTED] = now_ns
-    refuted[looks.evidence == Evidence.REFUTED] = now_ns
+    supported[checks.evidence == Evidence.SUPPORTED] = now_ns
+    refuted[checks.evidence == Evidence.REFUTED] = now_ns
     claimed = ClaimTracks(
-        looks.xy,
-        looks.velocity,
-        np.concatenate((looks.evidence[:, None].astype(np.int8), history), 1),
-        looks.score,
-        np.full(len(looks.xy), now_ns, np.int64),
+        checks.xy,
+        checks.velocity,
+        np.concatenate((checks.evidence[:, None].astype(np.int8), history), 1),
+        checks.score,
+        np.full(len(checks.xy), now_ns, np.int64),
         supported,
         refuted,
     )
     is_left = np.abs(now_ns - tracks.claimed_ns) <= MAX_UNCLAIMED_NS
-    is_left[looks.track[is_known]] = False
+    is_left[checks.track[is_known]] = False
     return concatenate(claimed, tracks[np.flatnonzero(is_left)[: max(0, MAX_TRACKS - len(claimed))]])
 
 

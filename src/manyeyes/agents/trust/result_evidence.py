@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evidence on each box of a result, and the bound on scores of boxes that rest on one sender which nobody can check."""
+"""Evidence on each box of a result, and the bound on scores of boxes that rest on one sender and cannot be checked."""
 
 from __future__ import annotations
 

@@ -2,8 +2,8 @@
 """Trust from evidence on each claimed object: the ego's detections and rays, third agents, and tracks of claims.
 
 A sender is named malicious if its claim is refuted again and again, never supported and not disputed; then, or at low trust, it is
-excluded for a term, watched, and returns. Its refuted claims are removed from the first frame on. Claims that nobody can check
-change no trust.
+excluded for a term, is still assessed, and returns. Its refuted claims are removed from the first frame on. Claims that cannot be
+checked change no trust.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from manyeyes.agents.isolation import Quarantine
 from manyeyes.agents.trust.association import Floats
 from manyeyes.agents.trust.beta_trust import BetaTrust, TrustConfig, fusion_weight, update
 from manyeyes.agents.trust.claim_evidence import CheckedClaims, EvidenceConfig, check_claims
-from manyeyes.agents.trust.claim_tracks import ClaimLooks, ClaimTracks, find_tracks, update_tracks
+from manyeyes.agents.trust.claim_tracks import ClaimChecks, ClaimTracks, find_tracks, update_tracks
 from manyeyes.agents.trust.interface import (
     AssessedClaims,
     Assessment,
@@ -42,9 +42,9 @@ LOW_TRUST = "low trust"
 class NamingConfig:
     """When a sender is named malicious.
 
-    min_score: of a claim that counts against its sender. min_refuted: of the last five looks at one claim. min_refuted_each: of the
-    looks at each of two claims. many_claims: above so many claims of all senders in one frame, min_refuted is one more, so that
-    more chances of an error do not make more errors. sign_change_ns: a place where the evidence turns within it is disputed.
+    min_score: of a claim that counts against its sender. min_refuted: of the last five checks of one claim. min_refuted_each: of
+    the checks of each of two claims. many_claims: above so many claims of all senders in one frame, min_refuted is one more,
+    since more chances of an error make more errors. sign_change_ns: a place where the evidence turns within it is disputed.
     """
 
     min_score: float = 0.5
@@ -81,21 +81,21 @@ class RayEvidenceDetector(MisbehaviourDetector):
             for one in received.claims
         ]
         checked, omits = self._check(received, now, unclaimed)
-        looks = [self._look(one, now) for one in checked]
-        now = replace(now, disputes=now.disputes.add(self._find_disputes(checked, looks, now), now.now_ns))
-        looks = [_mark_disputed(look, now.disputes.cover(look.xy)) for look in looks]
-        num_claims = sum(len(look.xy) for look in looks)
+        checks = [self._follow(one, now) for one in checked]
+        now = replace(now, disputes=now.disputes.add(self._find_disputes(checked, checks, now), now.now_ns))
+        checks = [_mark_disputed(check, now.disputes.cover(check.xy)) for check in checks]
+        num_claims = sum(len(check.xy) for check in checks)
         senders, exclusions, assessments = dict(now.senders), now.exclusions, list[SenderAssessment]()
-        for message, look, omitted, is_omitting in zip(received.messages, looks, unclaimed, omits):
+        for message, check, omitted, is_omitting in zip(received.messages, checks, unclaimed, omits):
             agent_id, is_faulty = message.agent_id, message.agent_id in received.faulty
-            memory = self._update_sender(now, message, look, is_omitting, is_faulty)
+            memory = self._update_sender(now, message, check, is_omitting, is_faulty)
             memory, exclusions = self._decide(
                 agent_id, replace(memory, omitted=omitted), exclusions, now, num_claims, is_faulty
             )
             senders[agent_id] = memory
             is_excluded = exclusions.contains(agent_id, now.now_ns)
             assessments.append(self._assess_sender(agent_id, memory, is_excluded, is_faulty))
-        claims = tuple(AssessedClaims(one.claims, look.evidence) for one, look in zip(checked, looks))
+        claims = tuple(AssessedClaims(one.claims, check.evidence) for one, check in zip(checked, checks))
         return Assessment(
             tuple(assessments), claims, replace(now, senders=forget_oldest(senders), exclusions=exclusions)
         )
@@ -134,43 +134,45 @@ class RayEvidenceDetector(MisbehaviourDetector):
             memory = replace(memory, trust=BetaTrust(*self.trust.returned), reason="")
         return memory, exclusions
 
-    def _look(self, one: CheckedClaims, now: TrustState) -> ClaimLooks:
+    def _follow(self, one: CheckedClaims, now: TrustState) -> ClaimChecks:
         """Associate claims with the tracks of their sender."""
         claims, tracks = one.claims, _memory(now, one.claims.agent_id).tracks
         track = find_tracks(tracks, claims.xy, claims.sigma_m)
-        return ClaimLooks(claims.xy, claims.velocity, claims.score, one.kinds, track)
+        return ClaimChecks(claims.xy, claims.velocity, claims.score, one.kinds, track)
 
-    def _find_disputes(self, checked: Sequence[CheckedClaims], looks: Sequence[ClaimLooks], now: TrustState) -> Floats:
+    def _find_disputes(
+        self, checked: Sequence[CheckedClaims], checks: Sequence[ClaimChecks], now: TrustState
+    ) -> Floats:
         """Return places (N, 2) where a trusted third agent contradicts the ego, or the ego's evidence turned."""
         places = [np.zeros((0, 2))]
-        for one, look in zip(checked, looks):
+        for one, check in zip(checked, checks):
             is_refuted, is_supported = one.kinds == Evidence.REFUTED, one.kinds == Evidence.SUPPORTED
             disputed, tracks = is_refuted & one.corroborated, _memory(now, one.claims.agent_id).tracks
             if len(tracks):
-                rows = look.track.clip(0)
+                rows = check.track.clip(0)
                 turned = is_refuted & self._is_recent(tracks.supported_ns[rows], now.now_ns)
                 turned |= is_supported & self._is_recent(tracks.refuted_ns[rows], now.now_ns)
-                disputed |= turned & (look.track >= 0)
-            places.append(look.xy[disputed])
+                disputed |= turned & (check.track >= 0)
+            places.append(check.xy[disputed])
         return np.concatenate(places)
 
     def _is_recent(self, time_ns: NDArray[np.int64], now_ns: int) -> NDArray[np.bool_]:
         return (time_ns > 0) & (np.abs(now_ns - time_ns) <= self.naming.sign_change_ns)
 
     def _update_sender(
-        self, now: TrustState, message: Message, looks: ClaimLooks, is_omitting: bool, is_faulty: bool
+        self, now: TrustState, message: Message, checks: ClaimChecks, is_omitting: bool, is_faulty: bool
     ) -> SenderMemory:
         """Return the memory of a sender after its claims of this frame; a message that was assessed before adds nothing."""
         trust, memory = now.trust_of(message.agent_id, self.trust), _memory(now, message.agent_id)
         if memory.captured_ns == message.timestamp_ns:
             return replace(memory, trust=trust, updated_ns=now.now_ns)
-        kinds, score = looks.evidence, looks.score
+        kinds, score = checks.evidence, checks.score
         is_support = (kinds == Evidence.SUPPORTED) | (kinds == Evidence.CORROBORATED)
         is_fault = (kinds == Evidence.REFUTED) & (score >= self.naming.min_score)
         fault = self.trust.refuted * float(score[is_fault].sum()) + self.trust.omitted * is_omitting
         if not is_faulty:
             trust = update(trust, float(score[is_support].sum()), fault, self.trust)
-        tracks = update_tracks(memory.tracks, looks, now.now_ns)
+        tracks = update_tracks(memory.tracks, checks, now.now_ns)
         return SenderMemory(trust, now.now_ns, message.timestamp_ns, tracks, memory.omitted, memory.reason)
 
     def _find_reason(self, tracks: ClaimTracks, num_claims: int) -> str:
@@ -180,7 +182,7 @@ class RayEvidenceDetector(MisbehaviourDetector):
         counts &= tracks.count(Evidence.DISPUTED) == 0
         needed = self.naming.min_refuted + (num_claims > self.naming.many_claims)
         if bool((counts & (refuted >= needed)).any()):
-            return f"a claim was refuted in {int(refuted[counts].max())} of its last looks and never supported"
+            return f"a claim was refuted in {int(refuted[counts].max())} of its last checks and never supported"
         num_claims_refuted = int((counts & (refuted >= self.naming.min_refuted_each)).sum())
         return f"{num_claims_refuted} claims were refuted repeatedly" if num_claims_refuted >= 2 else ""
 
@@ -206,6 +208,6 @@ def _own_objects(own: Boxes, min_score: float) -> OwnObjects:
     return OwnObjects(columns, own.velocity[kept].double().numpy(), np.ones(len(columns), np.int64))
 
 
-def _mark_disputed(looks: ClaimLooks, is_disputed: NDArray[np.bool_]) -> ClaimLooks:
-    """Return looks whose claims at disputed places are disputed, on either side."""
-    return replace(looks, evidence=np.where(is_disputed, np.uint8(Evidence.DISPUTED), looks.evidence))
+def _mark_disputed(checks: ClaimChecks, is_disputed: NDArray[np.bool_]) -> ClaimChecks:
+    """Return checks whose claims at disputed places are disputed, on either side."""
+    return replace(checks, evidence=np.where(is_disputed, np.uint8(Evidence.DISPUTED), checks.evidence))
