@@ -85,9 +85,8 @@ def kill_and_restart(team: Team, options: Options) -> Outcome:
             found = team.collect(0.2)
             ticks += flatten(found, victim)
             own = found.get(victim, [])
-            starts = [tick.time_s - tick.latency_ns / 1e9 / options.rate for tick in own]
-            if starts:
-                first_s = starts[0]
+            if own:
+                first_s = own[0].sent_s
         found = team.collect(1.0)
         ticks += flatten(found, victim)
         times = [
@@ -184,7 +183,7 @@ def flood(team: Team, options: Options) -> Outcome:
     before = {agent_id: rss_bytes(process)[0] for agent_id, process in team.processes.items()}
     child = os.fork()
     if child == 0:
-        _send_forged(team, options.seconds / options.rate)
+        _send_forged(team, options.seconds / options.rate, options.rate)
         os._exit(0)
     ticks = flatten(team.collect(options.seconds))
     os.waitpid(child, 0)
@@ -199,7 +198,7 @@ def flood(team: Team, options: Options) -> Outcome:
     )  # fmt: skip
 
 
-def _send_forged(team: Team, seconds: float) -> None:
+def _send_forged(team: Team, seconds: float, rate: float) -> None:
     """Send changed copies of captured packets."""
     network = open_network(replace(team.config, num_agents=0), 10**6, team.port, LiveClock())
     network.join(PLACE)
@@ -208,7 +207,7 @@ def _send_forged(team: Team, seconds: float) -> None:
     while time.monotonic() < until_s:
         captured = ([received.packet for received in network.poll()] + captured)[:16]
         began_s = time.monotonic()
-        for number in range(FLOOD_PER_S // 100 if captured else 0):
+        for number in range(round(FLOOD_PER_S * rate / 100) if captured else 0):
             packet = bytearray(captured[number % len(captured)])
             packet[-1 - number % 64] ^= 1 + number % 255
             network.send([bytes(packet)], PLACE)

@@ -54,10 +54,14 @@ class TeamConfig:
 
 @dataclass(frozen=True)
 class Tick:
-    """What a process reports of a frame. time_s: monotonic. dropped: refused packets so far, by reason."""
+    """What a process reports of a frame.
+
+    time_s: monotonic, at its end; sent_s: when its packets were sent. dropped: refused packets so far, by reason.
+    """
 
     agent_id: int
     time_s: float
+    sent_s: float
     fused: frozenset[int]
     ages_ns: tuple[int, ...]
     latency_ns: int
@@ -178,17 +182,19 @@ def run_agent(config: TeamConfig, agent_id: int, port: int, pipe: Connection) ->
     for tick in run:
         if control.delay_ns:
             clock.sleep(control.delay_ns)
-        pipe.send(_report(agent_id, tick))
+        pipe.send(_report(agent_id, tick, config.rate))
     network.close()
 
 
-def _report(agent_id: int, tick: LiveTick) -> Tick:
+def _report(agent_id: int, tick: LiveTick, rate: float) -> Tick:
+    now_s = time.monotonic()
+    sent_s = now_s - (tick.wait_ns + tick.perceive_ns) / 1e9 / rate
     dropped = {name: count for name, count in vars(tick.dropped).items() if count}
     fused = frozenset(one.message.agent_id for one in tick.perception.received)
     rejected = tuple(one.reason for one in tick.perception.rejected)
     files = len(list(Path("/proc/self/fd").iterdir())) if Path("/proc/self/fd").exists() else 0
     return Tick(
-        agent_id, time.monotonic(), fused, tick.ages_ns, tick.latency_ns, tick.missed, tick.level, tick.note, rejected, dropped,
+        agent_id, now_s, sent_s, fused, tick.ages_ns, tick.latency_ns, tick.missed, tick.level, tick.note, rejected, dropped,
         tick.received_packets, threading.active_count(), files,
     )  # fmt: skip
 

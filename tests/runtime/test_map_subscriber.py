@@ -3,15 +3,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 pytest.importorskip("cryptography", reason="the extra live is not installed")
 
 from tests.runtime.conftest import Federation
-from tests.runtime.fault_team import PLACE, AgentClock, FaultTeam, OneCar, frame_of
+from tests.runtime.fault_team import PLACE, START_NS, AgentClock, FaultTeam, OneCar, frame_of
 
-from manyeyes import Agent, AgentFrame
+from manyeyes import Agent, AgentFrame, load_detector
 from manyeyes.agents.map_perception import rectangle
 from manyeyes.agents.map_server import MapServer
 from manyeyes.agents.periodic_map import PeriodicMapPredictor
@@ -57,6 +59,26 @@ def test_a_live_run_leaves_a_fused_map(federation: Federation, tmp_path, mode: s
     # Boxes of a message and its map come in the same packets.
     ticks = team.step()
     assert all(len(tick.perception.received) == 2 for tick in ticks.values())
+
+
+@pytest.mark.slow
+def test_maps_beside_coded_tokens_are_used_without_the_weights_of_the_tokens(drive, federation, tmp_path) -> None:
+    frame = replace(drive(1).frame(0, 0), agent_id=1, timestamp_ns=START_NS)
+    line = LocalMap(MapElements.of([[[0.0, 0.0], [30.0, 0.0]]], DIVIDER, 0.9), rectangle((0.0, -15.0, 30.0, 15.0)))
+    agent = Agent(load_detector(), get_strategy("intermediate"), map_predictor=lambda frame, received=(): line)
+    team = FaultTeam(federation, tmp_path, num=2)
+    clock = AgentClock(team)
+    sender, network = (LocalNetwork(team.bus, k, clock.true_ns) for k in (1, 99))
+    subscriber = MapSubscriber(MapServer(), network, clock)
+    packets = agent.share(frame)
+    sender.send(packets, (0.0, 0.0))
+    assert len(packets) > 1 and subscriber.poll() == 1
+    assert subscriber.dropped.wrong_model > 0 and len(subscriber.server.observations[0].elements) == 1
+    # A message that lacks another packet is not complete.
+    later = agent.share(replace(frame, timestamp_ns=START_NS + 10**8))
+    team.ns += 10**8
+    sender.send(later[:-1], (0.0, 0.0))
+    assert subscriber.poll() == 0
 
 
 def test_a_map_is_sent_once_a_period() -> None:

@@ -11,18 +11,26 @@ fused = subscriber.server.rebuild()
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from dataclasses import replace
+
 from manyeyes.agents.map_server import MapServer
 from manyeyes.comms.admission import Authenticator
 from manyeyes.comms.drop_counts import DropCounts
-from manyeyes.comms.inbox import Inbox
+from manyeyes.comms.inbox import Inbox, ReceivedMessage
 from manyeyes.comms.network.interface import Network
+from manyeyes.comms.signatures.envelope import is_signed, split_signed
+from manyeyes.comms.wire import open_packet
 from manyeyes.runtime.clock import Clock
+
+MAX_MESSAGES = 256
+"""Number of messages whose unread packets are remembered, the last ones."""
 
 
 class MapSubscriber:
     """Moves local maps from a network to a map server. authenticator: of received packets; None accepts unsigned ones alone.
 
-    Tokens are not read: of a message, the local map is used.
+    Tokens need no weights here: packets of tokens that cannot be read count as received, and of a message the local map is used.
     """
 
     def __init__(
@@ -30,6 +38,7 @@ class MapSubscriber:
     ) -> None:
         self.server, self._network, self._clock = server, network, clock
         self._inbox = Inbox(authenticator=authenticator)
+        self._unread: OrderedDict[tuple[int, int], set[int]] = OrderedDict()
 
     @property
     def dropped(self) -> DropCounts:
@@ -39,5 +48,22 @@ class MapSubscriber:
     def poll(self) -> int:
         """Receive what arrived since the last call; return the number of new observations."""
         for received in self._network.poll():
+            before = self._inbox.dropped.wrong_model
             self._inbox.push(received.packet, received.arrival_ns, received.origin)
-        return len(self.server.ingest(self._inbox.received_messages(self._clock.now_ns())))
+            if self._inbox.dropped.wrong_model > before:
+                self._record_unread(received.packet)
+        return len(self.server.ingest(map(self._complete, self._inbox.received_messages(self._clock.now_ns()))))
+
+    def _record_unread(self, packet: bytes) -> None:
+        """Record a packet of tokens that was refused after all checks of its sender."""
+        envelope = open_packet(split_signed(packet).packet if is_signed(packet) else packet)
+        key = envelope.header.agent_id, envelope.header.timestamp_ns
+        self._unread.setdefault(key, set()).add(envelope.number)
+        if len(self._unread) > MAX_MESSAGES:
+            self._unread.popitem(last=False)
+
+    def _complete(self, one: ReceivedMessage) -> ReceivedMessage:
+        """Return a message as complete if only packets of unread tokens are missing."""
+        num_unread = len(self._unread.get((one.message.agent_id, one.message.timestamp_ns), ()))
+        is_complete = one.received_packets + num_unread >= one.expected_packets
+        return replace(one, received_packets=one.expected_packets) if is_complete else one

@@ -26,6 +26,7 @@ DEFAULT_PORT = 17_448
 _MAGIC = b"MU"
 _HEADER = struct.Struct("<2s8s2i")
 _RECEIVE_BYTES = 1 << 20
+_MAX_DATAGRAM = 65_535
 _POLL_S = 0.2
 
 
@@ -53,6 +54,7 @@ class UdpNetwork:
         self._config, self._rings = config, LinkRings(clock)
         self._tile: NetworkTile | None = None
         self._joined: dict[str, int] = {}
+        self._scopes: dict[NetworkTile, bytes] = {}
         self._address = socket.inet_aton(config.interface)
         try:
             self._receiver, self._sender = self._open()
@@ -117,6 +119,7 @@ class UdpNetwork:
         tile = NetworkTile.at(*position_xy) if self._tile is None else self._tile.move_to(*position_xy)
         if tile != self._tile:
             self._tile = tile
+            self._scopes = {other: self._scope(other) for other in tile.with_neighbours()}
             wanted = {self._group(other) for other in tile.with_neighbours()}
             for group in self._joined.keys() - wanted:
                 self._set_membership(socket.IP_DROP_MEMBERSHIP, group)
@@ -133,24 +136,25 @@ class UdpNetwork:
             raise ConfigError(f"Multicast group {group} on {self._config.interface}: {error}.") from error
 
     def _receive(self) -> None:
+        buffer = memoryview(bytearray(_MAX_DATAGRAM))
         while not self._stopped.is_set():
             ready, _, _ = select.select([self._receiver], [], [], _POLL_S)
             while ready and not self._stopped.is_set():
                 try:
-                    data, (host, port) = self._receiver.recvfrom(65_535)
+                    size, (host, port) = self._receiver.recvfrom_into(buffer)
                 except OSError:  # nothing is left
                     break
-                self._put(data, host, port)
+                self._put(buffer[:size], host, port)
 
-    def _put(self, data: bytes, host: str, port: int) -> None:
+    def _put(self, data: memoryview, host: str, port: int) -> None:
         """Store the packet of a datagram of this network and of a tile around, unless it is the agent's own."""
         tile = self._tile
         if len(data) < _HEADER.size or tile is None or (port == self._own_port and host == self._config.interface):
             return
         magic, scope, i, j = _HEADER.unpack_from(data)
         sent_in = NetworkTile(i, j)
-        if magic == _MAGIC and sent_in.is_next_to(tile) and scope == self._scope(sent_in):
-            self._rings.put(data[_HEADER.size :], Origin(f"{host}:{port}", sent_in.name))
+        if magic == _MAGIC and scope == self._scopes.get(sent_in):
+            self._rings.put(bytes(data[_HEADER.size :]), Origin(f"{host}:{port}", sent_in.name))
 
     def _scope(self, tile: NetworkTile) -> bytes:
         return hashlib.sha256(f"manyeyes/{self._config.network}/3/{tile.name}".encode()).digest()[:8]
