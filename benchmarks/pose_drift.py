@@ -7,7 +7,7 @@ window. *Smallest drift*: the slope that is reported in 95 % of runs within so m
 likelihood ratio, knows the noise and the begin. *Offset*: power of the test of one frame. The monitor does not know the
 autocorrelation.
 
-python -m benchmarks.pose_drift [--runs 400] [--out benchmarks/results/pose_drift.json]
+python -m benchmarks.pose_drift [--runs 240] [--out benchmarks/results/pose_drift.json]
 """
 
 from __future__ import annotations
@@ -78,8 +78,24 @@ def false_alarms(runs: int) -> Iterator[Line]:
         yield make_rate_line(f"{what}: drift or offset of a sound agent", np.array(drifts) | offsets, (None, None))
 
 
+def batched_false_alarms(runs: int) -> Iterator[Line]:
+    """Yield the same of the drift test alone, in every third frame, for more windows than the whole monitor is run on."""
+    config = PoseMonitorConfig()
+    for autocorrelation in AUTOCORRELATIONS:
+        noise = make_noise(runs, WARM_UP_FRAMES + WINDOW_FRAMES, autocorrelation, "batch", int(100 * autocorrelation))
+        alarms = np.zeros(runs, bool)
+        for end in range(WARM_UP_FRAMES, WARM_UP_FRAMES + WINDOW_FRAMES + 1, 3):
+            first = max(end - config.max_frames, 0)
+            time_s = np.arange(first, end) * PERIOD_S
+            found = find_drift(noise[:, first:end], time_s, np.ones(3), config.min_drift_frames)
+            alarms |= found.sigmas > config.drift_gate_sigmas
+        yield make_rate_line(
+            f"windows of 30 s, autocorrelation {autocorrelation:g}, every third frame: drift", alarms, (None, 0.01)
+        )
+
+
 def smallest_drifts(runs: int) -> Iterator[Line]:
-    """Yield the power at 1.0, 1.15 and 1.3 times the oracle's smallest drift; the target is 0.95 at 1.3 times."""
+    """Yield the power at 1.0 and 1.3 times the oracle's smallest drift; the target is 0.95 at 1.3 times."""
     config = PoseMonitorConfig()
     for autocorrelation, slopes in ORACLE.items():
         for frames, slope in zip(DRIFT_FRAMES, slopes):
@@ -88,11 +104,11 @@ def smallest_drifts(runs: int) -> Iterator[Line]:
                 runs, total, autocorrelation, "drift", frames, int(100 * autocorrelation)
             )
             elapsed = np.maximum(np.arange(total) - (SOUND_FRAMES - 1), 0) * PERIOD_S
-            for factor in (1.0, 1.15, 1.3):
+            for factor in (1.0, 1.3):
                 moved = noise.copy()
                 moved[:, :, 0] += factor * slope * elapsed
                 detected = np.zeros(runs, bool)
-                for end in range(SOUND_FRAMES + frames // 2, total + 1):
+                for end in range(total, SOUND_FRAMES + frames // 2, -3):
                     first = max(end - config.max_frames, 0)
                     time_s = np.arange(first, end) * PERIOD_S
                     stated = np.full(3, ORACLE_SIGMA_M**2)
@@ -114,11 +130,12 @@ def offsets() -> Iterator[Line]:
 def main() -> None:
     """The benchmark."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("--runs", type=int, default=400)
+    parser.add_argument("--runs", type=int, default=240)
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/pose_drift.json"))
     options = parser.parse_args()
     lines = []
-    for table in (offsets(), smallest_drifts(options.runs), false_alarms(options.runs)):
+    few = max(options.runs // 24, 1)
+    for table in (offsets(), smallest_drifts(options.runs // 2), batched_false_alarms(options.runs), false_alarms(few)):
         for line in table:
             sys.stdout.write(f"{line}\n")
             sys.stdout.flush()

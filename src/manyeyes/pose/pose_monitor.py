@@ -41,7 +41,7 @@ class PoseHealth(Enum):
 class PoseMonitorConfig:
     """max_frames: measured frames in memory. offset_window: frames over which an offset is averaged. min_drift_frames: frames that
     a drift lasts at least; twice as many are measured before it is tested. offset_gate, suspect_gate: limits of squared distances,
-    16.27 is p = 0.001 of one frame. drift_gate_sigmas: limit of the drift; at 4.9, fewer than one sound agent in a hundred is
+    16.27 is p = 0.001 of one frame. drift_gate_sigmas: limit of the drift; at 4.9, about one sound agent in a hundred is
     reported in half a minute at 10 Hz, whatever the autocorrelation of its errors (benchmarks/pose_drift.py).
     """
 
