@@ -110,6 +110,8 @@ def test_doctor_prints_json_for_a_bug_report(capsys) -> None:
         "ros",
         "train",
         "live",
+        "metrics",
+        "rerun",
     }
     assert {"cpu", "cores", "system", "git_commit", "weights", "towns", "towns_from", "package"} <= set(output)
 

@@ -53,6 +53,14 @@ demo --latency-budget-ms 1e300 | --latency-budget-ms
 live run {{rec}} --rate 0 | --rate
 live demo --rate nan | --rate
 live demo --agents 0 | --agents
+live map --seconds nan | --seconds
+live map --port 0 | --port
+report check-cells {{rec}} --count 0 | --count
+study byte-curves --data {{rec}} --budgets -5 | --budgets
+study attacks --data {{rec}} --counts -1 | --counts
+study attacks --data {{rec}} --attacks ghosts | ghosts
+study false-accusations --drives 0 | --drives
+study false-accusations --seconds nan | --seconds
 keys anchor --days 0 | --days
 keys issue stem --lifetime-min 0 | --lifetime-min
 keys pool --out pool --count 0 | --count
