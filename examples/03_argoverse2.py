@@ -13,7 +13,7 @@ if not root.is_dir():
     sys.exit(f"{root}: no Argoverse 2 logs here; give their folder.")
 recording = Argoverse2Recording(root, gap=1)
 snapshot = recording.snapshot(recording.scenarios[0], 0)
-detector = load_detector("costr-sensors")
+detector = load_detector()
 first, second = snapshot.frames
 packets = Agent(detector).share(second)
 perception = Agent(detector).perceive(first, packets)

@@ -143,7 +143,6 @@ def test_doctor_names_damaged_weights_and_exits_with_1(monkeypatch, capsys, tmp_
     output = capsys.readouterr()
     statuses = {status["name"]: status for status in json.loads(output.out)["weights"]}
     expected = {
-        "costr-sensors",
         "costr-small",
         "feakm-small",
         "map-small-camera",
