@@ -71,11 +71,11 @@ def _overlay_plan(plan: TrainPlan, given: Mapping[str, Any]) -> TrainPlan:
     for name, kind in (("released", DetectorConfig), ("codebook", CodebookConfig)):
         if name in given:
             changes[name] = _overlay_optional(getattr(plan, name), given[name], kind, name)
-    for name in ("start", "codebook_frames", "calibration_frames"):
+    for name in ("codebook_frames", "calibration_frames"):
         if name in given:
-            changes[name] = None if given[name] == NONE else given[name]
-    for name, kinds in (("start", str | None), ("codebook_frames", int), ("calibration_frames", int)):
-        if not isinstance(changes.get(name, getattr(plan, name)), kinds):
+            changes[name] = given[name]
+    for name in ("codebook_frames", "calibration_frames"):
+        if not isinstance(changes.get(name, getattr(plan, name)), int):
             raise ConfigError(f"{name} has another type; got {given[name]!r}.")
     return replace(plan, **changes)
 

@@ -78,4 +78,5 @@ def count_box_rays_reference(points: Tensor, origin: Tensor, boxes: Boxes, margi
         enter, leave = torch.minimum(one, two).amax(1).clamp_min(0), torch.maximum(one, two).amin(1).clamp_max(1)
         is_passing = (enter < leave) & ((1 - leave) * step.norm(dim=1) >= MIN_BEHIND_M) & (high > low).all()
         passing.append(int(is_passing.sum()))
-    return BoxRays(torch.tensor(passing, dtype=torch.int64), torch.tensor(hits, dtype=torch.int64))
+    counts = torch.tensor((passing, hits), dtype=torch.int64, device=points.device)
+    return BoxRays(counts[0], counts[1])
