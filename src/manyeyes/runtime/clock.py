@@ -44,7 +44,7 @@ def read_tai_ns() -> int:
     kernel = getattr(time, "CLOCK_TAI", None)
     if kernel is not None:
         tai_ns = time.clock_gettime_ns(kernel)
-        # A kernel that was not told the offset returns UTC.
+        # A kernel whose offset is not set returns UTC.
         if tai_ns - utc_ns > _MIN_KERNEL_TAI_NS:
             return tai_ns
     return utc_ns + TAI_UTC_NS
@@ -90,7 +90,7 @@ class LiveClock:
             return 0
         for _ in range(_NUM_READINGS):
             before_ns, reference_ns, after_ns = self._monotonic(), self._reference(), self._monotonic()
-            # Where the process was interrupted between the readings, their difference says nothing.
+            # Where the process was interrupted between the readings, their difference is no measure.
             if after_ns - before_ns <= _MAX_READING_NS:
                 return self._follow((before_ns + after_ns) // 2, reference_ns)
         return 0

@@ -2,7 +2,7 @@
 """Intermediate fusion whose ego estimates the pose error of each sender from its tokens (``models.fusion.sender_shift``).
 
 Messages are those of ``intermediate``. It works with any weights, beside or without a pose corrector: a corrector needs a track
-of a sender and says which pose is unusable, the shift is estimated from one message.
+of a sender and reports unusable poses, the shift is estimated from one message.
 """
 
 from __future__ import annotations

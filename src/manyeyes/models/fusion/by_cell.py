@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One feature a sender and cell: the sparse counterpart of the dense maps, moved to the ego's frame, that published fusions take.
 
-A dense map is zero where its agent has no feature; a sparse one has no row there. ``AbsentSenders`` says which of the two a fusion
+A dense map is zero where its agent has no feature; a sparse one has no row there. ``AbsentSenders`` names the one that a fusion
 computes with: "zero" is the letter of the papers, "masked" leaves absent senders out.
 """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Oracle: it is told which senders are malicious, and excludes them from the first frame. An upper bound, not a defence."""
+"""Oracle: it gets the ids of malicious senders, and excludes them from the first frame. An upper bound, not a defence."""
 
 from __future__ import annotations
 
