@@ -56,7 +56,7 @@ def run_agent(agent_id: int, keys: Path, port: int, start: Barrier) -> None:
     network.close()
     tick = max(ticks, key=lambda tick: len(tick.perception.boxes.score))
     cars = sorted((round(x + 3.0 * agent_id), round(y)) for x, y in tick.perception.boxes.center[:, :2].tolist())
-    print(f"agent {agent_id}: {tick.sent_bytes} bytes a frame, cars at x, y {cars}", flush=True)
+    print(f"agent {agent_id}: {tick.sent_bytes} bytes a frame, cars at x, y {cars}\n", end="", flush=True)  # one write
 
 
 if __name__ == "__main__":
