@@ -23,6 +23,9 @@ def test_a_service_is_ready_with_its_first_frame_and_feeds_its_watchdog(tmp_path
 
 def test_without_systemd_nothing_is_sent(monkeypatch) -> None:
     monkeypatch.delenv(SOCKET_VARIABLE, raising=False)
+    opened: list[object] = []
+    monkeypatch.setattr(socket, "socket", lambda *arguments: opened.append(arguments))
     supervisor = Supervisor()
     supervisor.tick()
     supervisor.stop()
+    assert not opened
