@@ -250,11 +250,13 @@ class Agent:
                 checked, rejections = self._check(frame, reception, now_ns, inbox.limits)
                 received += [] if checked is None else [checked]
                 rejected += rejections
-        untrusted = self._find_excluded([reception.message for reception in received], now_ns)
-        selected, left_out = select_for_fusion(frame, received, self._known_senders, inbox.limits, untrusted)
+        weights = self._find_weights([reception.message for reception in received], now_ns)
+        selected, left_out = select_for_fusion(frame, received, self._known_senders, inbox.limits, weights)
         perception, failed = self._perceive(frame, selected)
         for rejection in failed:
             inbox.discard(rejection.agent_id)
+        if perception.assessment is not None:
+            inbox.set_trust({sender.agent_id: sender.trust for sender in perception.assessment.senders})
         fused = {reception.message.agent_id for reception in perception.received}
         self._known_senders = update_known_senders(self._known_senders, fused, frame.timestamp_ns)
         # The pose of a fused sender was estimated.
@@ -360,6 +362,11 @@ class Agent:
             return frozenset()
         state = None if self._assessment is None else self._assessment.state
         return self.misbehaviour.excluded(state, [message.agent_id for message in messages], now_ns)
+
+    def _find_weights(self, messages: Sequence[Message], now_ns: int) -> dict[int, float]:
+        """Return the weights of senders by the last assessment; 0 of those that the misbehaviour detector excludes."""
+        last = {} if self._assessment is None else self._assessment.weights
+        return {**last, **dict.fromkeys(self._find_excluded(messages, now_ns), 0.0)}
 
     def _assess(
         self, frame: AgentFrame, received: Sequence[ReceivedMessage], corrections: Sequence[CorrectionOutcome]

@@ -19,6 +19,8 @@ KnownSenders = Mapping[int, tuple[int, int]]
 """Times (ns) of the first and of the last fusion of senders, by agent id."""
 MAX_GAP_NS = 2_000_000_000
 """A sender that was not fused for longer is unknown again."""
+MIN_SHARE = 256
+"""Number of tokens that a sender may have fused whatever its trust, so that it can regain it."""
 
 
 def update_known_senders(known: KnownSenders, fused: Collection[int], now_ns: int) -> KnownSenders:
@@ -37,20 +39,22 @@ def select_for_fusion(
     received: Sequence[ReceivedMessage],
     known: KnownSenders,
     limits: ReceiverLimits,
-    untrusted: Collection[int] = (),
+    weights: Mapping[int, float] | None = None,
 ) -> tuple[list[ReceivedMessage], list[Rejection]]:
     """Return at most limits.max_fused_senders messages, with at most limits.max_fused_tokens tokens; and the senders left out.
 
-    Messages with content come before empty ones, untrusted senders last, then senders in the order of their first fusion, so that
-    new ones displace none, then the nearest. The tokens of one message that exceed its share are left out in the order of their
-    proposed confidence.
+    weights: of senders by trust, in [0, 1]; 1 of all others. Messages with content come before empty ones, senders of weight 0 last,
+    then senders in the order of their first fusion, so that new ones displace none, then the nearest. Where there are too many
+    tokens, the demand of a sender is multiplied by its weight, but for MIN_SHARE tokens. The tokens of one message that exceed its
+    share are left out in the order of their proposed confidence.
     """
+    weights = weights or {}
     if len(received) > limits.max_fused_senders:
         order = sorted(
             received,
             key=lambda r: (
                 _is_empty(r.message),
-                r.message.agent_id in untrusted,
+                weights.get(r.message.agent_id, 1.0) <= 0.0,
                 first_fusion_ns(known, r.message.agent_id),
                 _distance_m(frame, r),
             ),
@@ -61,7 +65,11 @@ def select_for_fusion(
     kept = [r for r in received if r.message.agent_id in selected]
     left_out = [busy_rejection(r.message.agent_id, limits) for r in received if r.message.agent_id not in selected]
     counts = [r.num_tokens for r in kept]
-    shares = allocate_max_min_fair(limits.max_fused_tokens, counts)
+    demands = counts
+    if sum(counts) > limits.max_fused_tokens:
+        trusted = [min(1.0, weights.get(r.message.agent_id, 1.0)) for r in kept]
+        demands = [min(n, max(MIN_SHARE, round(w * n))) for w, n in zip(trusted, counts)]
+    shares = allocate_max_min_fair(limits.max_fused_tokens, demands)
     return [_keep_tokens(r, share) if share < n else r for r, n, share in zip(kept, counts, shares)], left_out
 
 

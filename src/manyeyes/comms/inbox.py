@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
@@ -168,6 +169,10 @@ class Inbox:
         """Drop the messages of all senders, and forget the senders: their times are those of another clock."""
         self._senders.clear()
         self._rejections.clear()
+
+    def set_trust(self, trust: Mapping[int, float]) -> None:
+        """Set the trust in senders, in [0, 1] by agent id: where no place is free, those of the lowest trust give way first."""
+        self._senders.set_trust(trust)
 
     def discard(self, agent_id: int) -> None:
         """Drop the messages of one sender; its next message is accepted again."""

@@ -7,6 +7,7 @@ without content, or with an earlier stamp, displaces no message of its own sende
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -21,6 +22,8 @@ REGULAR_MESSAGES = 3
 """Number of messages from which on a sender is received regularly."""
 PROVISIONAL_FRACTION = 0.25
 """Fraction of the places, the last ones, whose senders give way to new ones until they are received regularly."""
+MIN_TRUST, UNKNOWN_TRUST = 0.3, 2 / 3
+"""A sender of less than MIN_TRUST gives way to new ones wherever its place is; one that was not assessed has UNKNOWN_TRUST."""
 _PACKET_BYTES = 1024
 """Memory of the objects of one packet, besides its content."""
 _BYTES_PER_CODE_BYTE = 32
@@ -86,6 +89,7 @@ class SenderTable:
         self._limits = limits
         self._senders: dict[int, Sender] = {}
         self._num_packets = 0
+        self._trust: Mapping[int, float] = {}
         # Half of the memory is divided evenly, so that no sender exhausts that of others; the rest is for senders that need more.
         self._shared_memory = limits.max_total_bytes // 2
         self._own_memory = self._shared_memory // limits.max_senders
@@ -103,6 +107,11 @@ class SenderTable:
     def clear(self) -> None:
         """Forget all senders."""
         self._senders.clear()
+        self._trust = {}
+
+    def set_trust(self, trust: Mapping[int, float]) -> None:
+        """Set the trust in senders, in [0, 1] by agent id, in place of all before; it decides who gives way to a new sender."""
+        self._trust = dict(trust)
 
     def discard(self, agent_id: int) -> None:
         """Drop the messages of a sender."""
@@ -232,19 +241,23 @@ class SenderTable:
     def _make_place(self, arrival_ns: int | None) -> bool:
         """Return whether there is a place for a new sender.
 
-        A sender that has been silent gives way, else, in the last places, one that is not received regularly: of several the one
-        whose last packet is the oldest.
+        A sender that has been silent gives way, else one of less than MIN_TRUST, else, in the last places, one that is not received
+        regularly: of several the one of the lowest trust, and of these the one whose last packet is the oldest.
         """
         if len(self._senders) < self._limits.max_senders:
             return True
         num_provisional = max(1, int(PROVISIONAL_FRACTION * self._limits.max_senders))
         last = list(self._senders.items())[-num_provisional:]
         leaving = [item for item in self._senders.items() if self._is_silent(item[1], arrival_ns)]
+        leaving = leaving or [item for item in self._senders.items() if self._trust_of(item[0]) < MIN_TRUST]
         leaving = leaving or [item for item in last if item[1].num_messages < REGULAR_MESSAGES]
         if not leaving:
             return False
-        del self._senders[min(leaving, key=lambda item: item[1].last_packet)[0]]
+        del self._senders[min(leaving, key=lambda item: (self._trust_of(item[0]), item[1].last_packet))[0]]
         return True
+
+    def _trust_of(self, agent_id: int) -> float:
+        return self._trust.get(agent_id, UNKNOWN_TRUST)
 
     def _is_silent(self, sender: Sender, now_ns: int | None) -> bool:
         """Return whether nothing came from a sender for max_silence_ns; unknown without a clock, hence False."""

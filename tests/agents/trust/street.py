@@ -58,7 +58,9 @@ def scan(solid: Boxes) -> torch.Tensor:
 
 @dataclass
 class Street:
-    """The ego's view over time. solid: what is there; own: what the ego detects. spoil: changes the returns of a frame."""
+    """The ego's view over time. solid: what is there; own: what the ego detects. spoil: changes the returns of a frame. stated:
+    positions that senders state in their own frames, by id.
+    """
 
     detector: MisbehaviourDetector
     solid: Boxes = field(default_factory=lambda: Boxes.cat([cars(SEEN, SEEN_TOO, HIDDEN), wall()]))
@@ -66,6 +68,7 @@ class Street:
     spoil: Callable[[torch.Tensor, int], torch.Tensor] = lambda points, index: points
     state: object | None = None
     index: int = 0
+    stated: Mapping[int, np.ndarray] = field(default_factory=dict)
 
     def step(
         self,
@@ -82,7 +85,10 @@ class Street:
         frame = AgentFrame.of(PointCloud.of(points), pose, 0, now_ns, sensor_height_m=HEIGHT_M)
         stated = tuple(
             replace(
-                Claims.of(agent_id, boxes, np.full(len(boxes), sigma_m)), sender_xy=sender_xy, is_complete=is_complete
+                Claims.of(agent_id, boxes, np.full(len(boxes), sigma_m)),
+                sender_xy=sender_xy,
+                is_complete=is_complete,
+                stated_xy=self.stated.get(agent_id),
             )
             for agent_id, boxes in sorted(claims.items())
         )

@@ -33,7 +33,8 @@ class Claims:
 
     columns: (N, 7) centre, size (metres) and yaw; velocity: (N, 2) m/s; score: (N,). sigma_m: (N,) metres, of the centres: of both
     poses, of the object, and of its motion since the message. sender_xy: of the sender. is_complete: the message states all
-    objects that its sender detects, so that a missing one means something; tokens within a budget do not.
+    objects that its sender detects, so that a missing one means something; tokens within a budget do not. stated_xy: (N, 2) centres
+    as stated, in the sender's frame at the time of its message; None where unknown.
     """
 
     agent_id: int
@@ -44,6 +45,7 @@ class Claims:
     sender_xy: tuple[float, float] = (0.0, 0.0)
     age_s: float = 0.0
     is_complete: bool = False
+    stated_xy: Floats | None = None
 
     @classmethod
     def of(cls, agent_id: int, boxes: Boxes, sigma_m: Floats) -> Claims:
@@ -56,7 +58,8 @@ class Claims:
 
     def __getitem__(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Claims:
         names = ("columns", "velocity", "score", "sigma_m")
-        return replace(self, **{name: getattr(self, name)[rows] for name in names})
+        stated = None if self.stated_xy is None else self.stated_xy[rows]
+        return replace(self, stated_xy=stated, **{name: getattr(self, name)[rows] for name in names})
 
     @property
     def xy(self) -> Floats:
@@ -89,6 +92,7 @@ def _extract(frame: AgentFrame, cache: PerceptionCache, message: Message) -> Cla
     x, y, yaw = np.diagonal((frame.pose_covariance + message.pose_covariance).double().numpy()).clip(0).tolist()
     variance = (x + y) / 2 + yaw * (center[:, :2] ** 2).sum(1)
     variance += sigma_xy**2 + (SIGMA_VELOCITY_MPS * seconds) ** 2
+    stated_xy = center[:, :2].copy()
     center[:, :2] += velocity * seconds
     turn = math.atan2(rotation[1, 0], rotation[0, 0])
     columns = (center @ rotation.T + origin, size, (box_yaw + turn)[:, None])
@@ -101,6 +105,7 @@ def _extract(frame: AgentFrame, cache: PerceptionCache, message: Message) -> Cla
         (float(origin[0]), float(origin[1])),
         seconds,
         message.objects is not None and message.tokens is None,
+        stated_xy,
     )
     is_finite = np.isfinite(claims.columns).all(1) & np.isfinite(claims.sigma_m)
     return claims if is_finite.all() else claims[is_finite]

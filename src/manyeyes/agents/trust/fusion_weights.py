@@ -69,20 +69,20 @@ def _remove_near(frame: AgentFrame, message: Message, places: Tensor) -> Message
     objects, tokens, score = message.objects, message.tokens, message.token_score
     descriptors = message.descriptors
     if objects is not None:
-        is_kept = _is_far(_object_places(objects, seconds, ego_from_other), places)
+        is_kept = _is_far(object_places(objects, seconds, ego_from_other), places)
         descriptors = None if descriptors is None else descriptors[is_kept]
         objects = objects[is_kept]
     if tokens is not None:
-        is_kept = _is_far(_token_places(tokens, seconds, ego_from_other), places)
+        is_kept = _is_far(token_places(tokens, seconds, ego_from_other), places)
         tokens, score = tokens.keep(is_kept), None if score is None else score[is_kept]
     return replace(message, objects=objects, tokens=tokens, token_score=score, descriptors=descriptors)
 
 
-def _object_places(objects: Boxes, seconds: float, ego_from_other: Transform) -> Tensor:
+def object_places(objects: Boxes, seconds: float, ego_from_other: Transform) -> Tensor:
     return ego_from_other.apply(objects.after(seconds).center.double())[:, :2]
 
 
-def _token_places(tokens: SparseBev, seconds: float, ego_from_other: Transform) -> Tensor:
+def token_places(tokens: SparseBev, seconds: float, ego_from_other: Transform) -> Tensor:
     """Return the centres (N, 2) that tokens propose, in the ego's frame at its time."""
     xy = proposed_centres(tokens) + proposed_velocity(tokens.features[:, -PROPOSAL_DIM:]) * seconds
     return ego_from_other.apply(torch.cat((xy, xy.new_zeros(len(xy), 1)), 1).double())[:, :2]

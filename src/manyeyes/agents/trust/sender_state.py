@@ -10,6 +10,7 @@ from manyeyes.agents.isolation import Quarantine
 from manyeyes.agents.trust.association import Floats
 from manyeyes.agents.trust.beta_trust import BetaTrust, TrustConfig, decay
 from manyeyes.agents.trust.claim_tracks import ClaimTracks, move_tracks
+from manyeyes.agents.trust.copies import StatedContent
 from manyeyes.agents.trust.disputes import Disputes
 from manyeyes.agents.trust.omissions import OwnObjects
 from manyeyes.datatypes import AgentFrame, Transform
@@ -26,7 +27,8 @@ MAX_GAP_NS = 1_000_000_000
 class SenderMemory:
     """One sender: its trust at updated_ns; the capture time of its last message; tracks of its claims; objects that it omits.
 
-    reason: of its exclusion; empty if it is not excluded.
+    reason: of its exclusion; empty if it is not excluded. contents: of its last messages; copies: which of them were copies, the
+    newest first. contradicted_ns: when its stated pose was last contradicted.
     """
 
     trust: BetaTrust
@@ -35,6 +37,9 @@ class SenderMemory:
     tracks: ClaimTracks
     omitted: OwnObjects
     reason: str = ""
+    contents: tuple[StatedContent, ...] = ()
+    copies: tuple[bool, ...] = ()
+    contradicted_ns: int = NEVER_NS
 
 
 UNKNOWN_SENDER = SenderMemory(BetaTrust(*TrustConfig().prior), 0, NEVER_NS, ClaimTracks.empty(), OwnObjects.empty())

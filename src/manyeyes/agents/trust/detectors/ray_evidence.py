@@ -8,7 +8,7 @@ checked change no trust.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -20,7 +20,9 @@ from manyeyes.agents.isolation import Quarantine
 from manyeyes.agents.trust.association import Floats
 from manyeyes.agents.trust.beta_trust import BetaTrust, TrustConfig, fusion_weight, update
 from manyeyes.agents.trust.claim_evidence import CheckedClaims, EvidenceConfig, check_claims
+from manyeyes.agents.trust.claim_offset import OffsetConfig, find_offset
 from manyeyes.agents.trust.claim_tracks import ClaimChecks, ClaimTracks, find_tracks, update_tracks
+from manyeyes.agents.trust.copies import CopyConfig, add_contents, find_copies, is_known
 from manyeyes.agents.trust.interface import (
     AssessedClaims,
     Assessment,
@@ -32,10 +34,31 @@ from manyeyes.agents.trust.interface import (
 )
 from manyeyes.agents.trust.omissions import OmissionConfig, OwnObjects, find_unclaimed, is_in_sight, make_probes
 from manyeyes.agents.trust.registry import register_misbehaviour_detector
-from manyeyes.agents.trust.sender_state import UNKNOWN_SENDER, SenderMemory, TrustState, advance, forget_oldest
+from manyeyes.agents.trust.sender_state import (
+    NEVER_NS,
+    UNKNOWN_SENDER,
+    SenderMemory,
+    TrustState,
+    advance,
+    forget_oldest,
+)
 from manyeyes.datatypes import Boxes, Message
 
 LOW_TRUST = "low trust"
+NUM_COPY_CHECKS = 5
+
+
+@dataclass(frozen=True)
+class _Findings:
+    """What the messages of one frame show as wholes. contradicted: senders whose stated pose is. copied: sources by their copiers."""
+
+    contradicted: frozenset[int]
+    copied: Mapping[int, int]
+
+    @property
+    def unused(self) -> frozenset[int]:
+        """Senders whose content is not fused in this frame and corroborates nothing."""
+        return self.contradicted | self.copied.keys()
 
 
 @dataclass(frozen=True)
@@ -57,12 +80,14 @@ class NamingConfig:
 @register_misbehaviour_detector("ray-evidence")
 @dataclass(frozen=True)
 class RayEvidenceDetector(MisbehaviourDetector):
-    """Evidence, trust, omissions and naming, each with its constants."""
+    """Evidence, trust, omissions, common offsets, copies and naming, each with its constants."""
 
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
     trust: TrustConfig = field(default_factory=TrustConfig)
     omissions: OmissionConfig = field(default_factory=OmissionConfig)
     naming: NamingConfig = field(default_factory=NamingConfig)
+    offset: OffsetConfig = field(default_factory=OffsetConfig)
+    copies: CopyConfig = field(default_factory=CopyConfig)
 
     def excluded(self, state: object | None, agent_ids: Collection[int], now_ns: int) -> frozenset[int]:
         """Return the senders whose term of exclusion has not ended."""
@@ -80,31 +105,53 @@ class RayEvidenceDetector(MisbehaviourDetector):
             )
             for one in received.claims
         ]
-        checked, omits = self._check(received, now, unclaimed)
+        now, found = self._compare_messages(received, now)
+        checked, omits = self._check(received, now, unclaimed, found)
         checks = [self._follow(one, now) for one in checked]
         now = replace(now, disputes=now.disputes.add(self._find_disputes(checked, checks, now), now.now_ns))
         checks = [_mark_disputed(check, now.disputes.cover(check.xy)) for check in checks]
         num_claims = sum(len(check.xy) for check in checks)
         senders, exclusions, assessments = dict(now.senders), now.exclusions, list[SenderAssessment]()
         for message, check, omitted, is_omitting in zip(received.messages, checks, unclaimed, omits):
-            agent_id, is_faulty = message.agent_id, message.agent_id in received.faulty
-            memory = self._update_sender(now, message, check, is_omitting, is_faulty)
+            agent_id = message.agent_id
+            is_faulty = agent_id in received.faulty or agent_id in found.contradicted
+            memory = self._update_sender(now, message, check, is_omitting, is_faulty or agent_id in found.copied)
             memory, exclusions = self._decide(
                 agent_id, replace(memory, omitted=omitted), exclusions, now, num_claims, is_faulty
             )
             senders[agent_id] = memory
             is_excluded = exclusions.contains(agent_id, now.now_ns)
-            assessments.append(self._assess_sender(agent_id, memory, is_excluded, is_faulty))
+            assessments.append(self._assess_sender(agent_id, memory, is_excluded, is_faulty, found))
         claims = tuple(AssessedClaims(one.claims, check.evidence) for one, check in zip(checked, checks))
         return Assessment(
             tuple(assessments), claims, replace(now, senders=forget_oldest(senders), exclusions=exclusions)
         )
 
+    def _compare_messages(self, received: MisbehaviourInput, now: TrustState) -> tuple[TrustState, _Findings]:
+        """Return the state with what each message as a whole shows, and that: common offsets of its claims, and copied content."""
+        own = received.own.center[received.own.score >= self.evidence.min_own_score, :2].double().numpy()
+        times_ns = [message.timestamp_ns for message in received.messages]
+        contents = {agent_id: memory.contents for agent_id, memory in now.senders.items() if memory.contents}
+        copied = find_copies(received.claims, times_ns, contents, self.copies)
+        senders, contradicted = dict(now.senders), set[int]()
+        for one, time_ns in zip(received.claims, times_ns):
+            memory = _memory(now, one.agent_id)
+            is_wrong = find_offset(one.xy, own, one.sender_xy, self.offset).contradicts(self.offset)
+            if is_wrong is not None:
+                memory = replace(memory, contradicted_ns=now.now_ns if is_wrong else NEVER_NS)
+            if memory.contradicted_ns >= now.now_ns - round(self.offset.memory_s * 1e9):
+                contradicted.add(one.agent_id)
+            if not is_known(memory.contents, time_ns):
+                checks = (one.agent_id in copied, *memory.copies)[:NUM_COPY_CHECKS]
+                memory = replace(memory, copies=checks, contents=add_contents(memory.contents, one, time_ns))
+            senders[one.agent_id] = replace(memory, trust=now.trust_of(one.agent_id, self.trust), updated_ns=now.now_ns)
+        return replace(now, senders=senders), _Findings(frozenset(contradicted), copied)
+
     def _check(
-        self, received: MisbehaviourInput, now: TrustState, unclaimed: Sequence[OwnObjects]
+        self, received: MisbehaviourInput, now: TrustState, unclaimed: Sequence[OwnObjects], found: _Findings
     ) -> tuple[tuple[CheckedClaims, ...], list[bool]]:
         """Return the evidence on all claims, and whether each sender omits an object; excluded senders corroborate nothing."""
-        excluded = self.excluded(now, received.agent_ids, now.now_ns)
+        excluded = self.excluded(now, received.agent_ids, now.now_ns) | found.unused
         trust = {a: now.trust_of(a, self.trust).mean for a in received.agent_ids if a not in excluded}
         probes = [make_probes(one, c.sender_xy, self.omissions) for one, c in zip(unclaimed, received.claims)]
         own = received.own.center[received.own.score >= self.evidence.min_own_score, :2].double().numpy()
@@ -124,7 +171,7 @@ class RayEvidenceDetector(MisbehaviourDetector):
         is_faulty: bool,
     ) -> tuple[SenderMemory, Quarantine]:
         """Begin or end the exclusion of a sender."""
-        named = "" if is_faulty else self._find_reason(memory.tracks, num_claims)
+        named = "" if is_faulty else self._find_reason(memory, num_claims)
         is_low = memory.trust.mean < self.trust.min_trust and not is_faulty
         if exclusions.contains(agent_id, now.now_ns):
             return memory, exclusions
@@ -173,10 +220,13 @@ class RayEvidenceDetector(MisbehaviourDetector):
         if not is_faulty:
             trust = update(trust, float(score[is_support].sum()), fault, self.trust)
         tracks = update_tracks(memory.tracks, checks, now.now_ns)
-        return SenderMemory(trust, now.now_ns, message.timestamp_ns, tracks, memory.omitted, memory.reason)
+        return replace(memory, trust=trust, updated_ns=now.now_ns, captured_ns=message.timestamp_ns, tracks=tracks)
 
-    def _find_reason(self, tracks: ClaimTracks, num_claims: int) -> str:
+    def _find_reason(self, memory: SenderMemory, num_claims: int) -> str:
         """Return why a sender is named malicious, or nothing."""
+        tracks = memory.tracks
+        if sum(memory.copies) >= self.copies.min_copies:
+            return f"{sum(memory.copies)} of its last messages were copies of others' content"
         refuted = tracks.count(Evidence.REFUTED)
         counts = (tracks.score >= self.naming.min_score) & (tracks.count(Evidence.SUPPORTED) == 0)
         counts &= tracks.count(Evidence.DISPUTED) == 0
@@ -187,11 +237,16 @@ class RayEvidenceDetector(MisbehaviourDetector):
         return f"{num_claims_refuted} claims were refuted repeatedly" if num_claims_refuted >= 2 else ""
 
     def _assess_sender(
-        self, agent_id: int, memory: SenderMemory, is_excluded: bool, is_faulty: bool
+        self, agent_id: int, memory: SenderMemory, is_excluded: bool, is_faulty: bool, found: _Findings
     ) -> SenderAssessment:
         trust = memory.trust.mean
         if is_excluded:
             return SenderAssessment(agent_id, trust, 0.0, SenderStatus.MALICIOUS, memory.reason)
+        if agent_id in found.contradicted:
+            reason = "its claims have a common offset to the ego's detections"
+            return SenderAssessment(agent_id, trust, 0.0, SenderStatus.FAULTY, reason)
+        if agent_id in found.copied:
+            return SenderAssessment(agent_id, trust, 0.0, reason=f"its content is that of agent {found.copied[agent_id]}")
         status = SenderStatus.FAULTY if is_faulty else SenderStatus.NORMAL
         reason = "its poses have an offset or a drift" if is_faulty else ""
         return SenderAssessment(agent_id, trust, fusion_weight(trust, self.trust), status, reason)

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Copies: content that another agent sent before, stated under another identity.
+
+Two agents never measure the same positions in their own frames to a centimetre. Of equal content the later one is the copy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from manyeyes.agents.trust.association import Floats, associate
+from manyeyes.agents.trust.claims import Claims
+
+NUM_KEPT = 4
+"""Number of messages of a sender whose content is kept."""
+
+
+@dataclass(frozen=True)
+class CopyConfig:
+    """max_copied: fraction of claims at equal positions above which content is a copy. equal_m: of equal positions. min_equal: such
+    claims. min_copies: of the last five messages of a sender that must be copies before it is named malicious.
+    """
+
+    max_copied: float = 0.6
+    equal_m: float = 0.02
+    min_equal: int = 3
+    min_copies: int = 3
+
+
+@dataclass(frozen=True)
+class StatedContent:
+    """Positions (N, 2) that a sender stated in its own frame in a message captured at a time."""
+
+    timestamp_ns: int
+    xy: Floats
+
+
+Contents = Mapping[int, tuple[StatedContent, ...]]
+"""Content of the last messages by agent id, the newest first."""
+
+
+def find_copies(claims: Sequence[Claims], times_ns: Sequence[int], earlier: Contents, config: CopyConfig) -> dict[int, int]:
+    """Return the sources by the senders that copy them. times_ns: of capture of each sender's message.
+
+    A message is compared with the messages of other senders from earlier frames. Senders that state equal content in the same frame
+    for the first time are both left: nothing shows which of them copied.
+    """
+    found = dict[int, int]()
+    for one, time_ns in zip(claims, times_ns):
+        known = earlier.get(one.agent_id, ())
+        if one.stated_xy is None or len(one.stated_xy) < config.min_equal or is_known(known, time_ns):
+            continue
+        for agent_id, contents in earlier.items():
+            if agent_id != one.agent_id and any(is_equal(one.stated_xy, other.xy, config) for other in contents):
+                found[one.agent_id] = agent_id
+                break
+    return found
+
+
+def is_known(contents: Sequence[StatedContent], time_ns: int) -> bool:
+    """Return whether a message was compared in an earlier frame."""
+    return any(content.timestamp_ns == time_ns for content in contents)
+
+
+def is_equal(one: Floats, other: Floats, config: CopyConfig) -> bool:
+    """Return whether most of the fewer positions, (N, 2) and (M, 2), are equal."""
+    fewest = min(len(one), len(other))
+    if fewest < config.min_equal:
+        return False
+    num_equal = int((associate(one, other, config.equal_m) >= 0).sum())
+    return num_equal >= config.min_equal and num_equal > config.max_copied * fewest
+
+
+def add_contents(earlier: tuple[StatedContent, ...], one: Claims, time_ns: int) -> tuple[StatedContent, ...]:
+    """Return the contents of a sender with that of its message."""
+    if one.stated_xy is None or is_known(earlier, time_ns):
+        return earlier
+    return (StatedContent(time_ns, one.stated_xy), *earlier)[:NUM_KEPT]
