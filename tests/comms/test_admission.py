@@ -389,3 +389,23 @@ def test_one_sender_does_not_use_the_memory_of_another() -> None:
     for packet in packets_of(replace(header(4), tokens=tokens(200)), 1398):
         inbox.push(packet, NOW)
     assert inbox.dropped == before and inbox.received_messages()[-1].complete
+
+
+def test_of_silent_senders_the_least_trusted_gives_way() -> None:
+    inbox = Inbox(limits=replace(LIMITS, max_senders=3))
+    for agent in (1, 2, 3):
+        inbox.push(empty(agent), NOW)
+    inbox.set_trust({1: 0.9, 2: 0.4, 3: 0.8})
+    later = NOW + LIMITS.max_silence_ns + TENTH_NS
+    inbox.push(empty(9, later), later)
+    assert {m.agent_id for m in inbox.messages()} == {1, 3, 9}
+
+
+def test_a_sender_of_low_trust_gives_way_though_it_is_received_regularly() -> None:
+    inbox = Inbox(limits=replace(LIMITS, max_senders=3))
+    drive(inbox, range(1, 4), 0, 5)
+    drive(inbox, range(9, 10), 5, 6)
+    assert {m.agent_id for m in inbox.messages()} == {1, 2, 3}
+    inbox.set_trust({2: 0.1})
+    drive(inbox, range(9, 10), 6, 7)
+    assert {m.agent_id for m in inbox.messages()} == {1, 3, 9}

@@ -43,6 +43,7 @@ from manyeyes.agents.token_codec import (
 from manyeyes.agents.trust.claims import extract_claims
 from manyeyes.agents.trust.fusion_weights import weigh_received
 from manyeyes.agents.trust.interface import Assessment, MisbehaviourDetector, MisbehaviourInput
+from manyeyes.agents.trust.orphans import bound_orphans, find_orphans
 from manyeyes.agents.trust.result_evidence import ResultEvidence, bound_scores, find_result_evidence
 from manyeyes.comms import wire
 from manyeyes.comms.admission import Authenticator
@@ -349,7 +350,7 @@ class Agent:
                 messages = self.message_history.update_and_get(messages, frame.timestamp_ns, untrusted)
             boxes = self.strategy.fuse(self.perception_cache, frame, messages)
             own = self.perception_cache.process(frame).boxes
-            boxes = remove_own_body(restore_own_boxes(boxes, own), frame)
+            boxes = self._bound_orphans(frame, remove_own_body(restore_own_boxes(boxes, own), frame), messages)
             evidence = find_result_evidence(boxes, own, self._assessment)
             perception = Perception(boxes, usable, corrections, distrusted, self._assessment, evidence)
             return _Attempt(perception, self._state)
@@ -396,6 +397,17 @@ class Agent:
         state = None if self._assessment is None else self._assessment.state
         self._assessment = self.misbehaviour.assess(content, state)
         return weigh_received(frame, known, self._assessment)
+
+    def _bound_orphans(self, frame: AgentFrame, boxes: Boxes, messages: Sequence[Message]) -> Boxes:
+        """Return the boxes with bounded scores where nobody proposes an object; senders of several such are recorded."""
+        if self.misbehaviour is None or self._assessment is None or self._assessment.claims is None:
+            return boxes
+        orphans = find_orphans(frame, boxes, self.perception_cache, messages)
+        if orphans is None:
+            return boxes
+        state = self.misbehaviour.record_orphans(self._assessment.state, orphans.senders)
+        self._assessment = replace(self._assessment, state=state)
+        return bound_orphans(boxes, orphans)
 
     @property
     def _state(self) -> _State:

@@ -43,10 +43,10 @@ def select_for_fusion(
 ) -> tuple[list[ReceivedMessage], list[Rejection]]:
     """Return at most limits.max_fused_senders messages, with at most limits.max_fused_tokens tokens; and the senders left out.
 
-    weights: of senders by trust, in [0, 1]; 1 of all others. Messages with content come before empty ones, senders of weight 0 last,
-    then senders in the order of their first fusion, so that new ones displace none, then the nearest. Where there are too many
-    tokens, the demand of a sender is multiplied by its weight, but for MIN_SHARE tokens. The tokens of one message that exceed its
-    share are left out in the order of their proposed confidence.
+    weights: of senders by trust, in [0, 1]; 1 of all others. Messages with content come before empty ones, senders of weight 0
+    last, then senders in the order of their first fusion, so that new ones displace none, then the nearest. Where there are too
+    many tokens, the demand of a sender is multiplied by its weight, but for MIN_SHARE tokens. The tokens of one message that
+    exceed its share are left out in the order of their proposed confidence.
     """
     weights = weights or {}
     if len(received) > limits.max_fused_senders:

@@ -36,8 +36,8 @@ def search_offset(
 ) -> tuple[float, float, int, float]:  # pragma: no cover
     """Try every shift of one claim onto one detection after every turn about the pivot.
 
-    limits: search_m, tolerance_m, max_offset_m, ratio, margin of ``OffsetConfig``. Returns the best agreement of displacements up to
-    max_offset_m, the best of larger ones, and the number of pairs and the displacement of the latter.
+    limits: search_m, tolerance_m, max_offset_m, ratio, margin of ``OffsetConfig``. Returns the best agreement of displacements up
+    to max_offset_m, the best of larger ones, and the number of pairs and the displacement of the latter.
     """
     search_m, tolerance_m, max_offset_m, ratio, margin = limits
     near, _, _ = score_shift(claims, claims, detections, 0.0, 0.0, tolerance_m)

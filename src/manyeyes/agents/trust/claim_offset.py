@@ -30,16 +30,16 @@ class OffsetConfig:
     turn_step_deg: float = 1.5
     tolerance_m: float = 0.7
     max_offset_m: float = 1.2
-    min_pairs: int = 4
+    min_pairs: int = 5
     ratio: float = 1.3
-    margin: float = 1.0
+    margin: float = 1.5
     memory_s: float = 1.0
 
 
 @dataclass(frozen=True)
 class ClaimOffset:
-    """Agreement of claims with detections, in claims: the best of a consistent pose, and the best of a larger displacement, with its
-    number of claims and their mean displacement, metres.
+    """Agreement of claims with detections, in claims: the best of a consistent pose, and the best of a larger displacement, with
+    its number of claims and their mean displacement, metres.
     """
 
     consistent: float

@@ -40,7 +40,9 @@ Contents = Mapping[int, tuple[StatedContent, ...]]
 """Content of the last messages by agent id, the newest first."""
 
 
-def find_copies(claims: Sequence[Claims], times_ns: Sequence[int], earlier: Contents, config: CopyConfig) -> dict[int, int]:
+def find_copies(
+    claims: Sequence[Claims], times_ns: Sequence[int], earlier: Contents, config: CopyConfig
+) -> dict[int, int]:
     """Return the sources by the senders that copy them. times_ns: of capture of each sender's message.
 
     A message is compared with the messages of other senders from earlier frames. Senders that state equal content in the same frame

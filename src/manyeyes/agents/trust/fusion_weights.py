@@ -79,6 +79,7 @@ def _remove_near(frame: AgentFrame, message: Message, places: Tensor) -> Message
 
 
 def object_places(objects: Boxes, seconds: float, ego_from_other: Transform) -> Tensor:
+    """Return the centres (N, 2) of objects, in the ego's frame at its time."""
     return ego_from_other.apply(objects.after(seconds).center.double())[:, :2]
 
 

@@ -125,7 +125,7 @@ class MisbehaviourDetector(Protocol):
     """A method that finds senders whose content is wrong; a class may derive from it, which gives the defaults.
 
     It holds settings only and can be shared by agents: what it remembers is the state, which each agent stores if its perception
-    succeeds. Both methods are deterministic.
+    succeeds. All methods are deterministic.
     """
 
     def excluded(self, state: object | None, agent_ids: Collection[int], now_ns: int) -> frozenset[int]:
@@ -135,3 +135,9 @@ class MisbehaviourDetector(Protocol):
     def assess(self, received: MisbehaviourInput, state: object | None) -> Assessment:
         """Assess the senders of one frame before its fusion. state: of the last frame; None at first."""
         ...
+
+    def record_orphans(self, state: object | None, agent_ids: Collection[int]) -> object | None:
+        """Return the state after a fusion. agent_ids: senders of tokens near several fused boxes that nobody proposes
+        (``agents.trust.orphans``). The same state by default.
+        """
+        return state

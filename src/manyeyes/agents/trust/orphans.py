@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Orphans: fused boxes that neither the ego detects nor any sender proposes, the mark of features that were optimised against fusion.
+"""Orphans: fused boxes that neither the ego detects nor any sender proposes, the mark of features made against fusion.
 
 A learned fusion may move an object or sharpen it, but it has no reason to find one where no agent proposes any.
 """
@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from manyeyes.agents.perception_cache import PerceptionCache, TokenOutput
 from manyeyes.agents.strategies.message_header import age_s, ego_from_sender
 from manyeyes.agents.trust.association import Floats, find_nearest
 from manyeyes.agents.trust.fusion_weights import object_places, token_places
@@ -38,33 +39,48 @@ class Orphans:
     senders: frozenset[int]
 
 
-def find_orphans(frame: AgentFrame, boxes: Boxes, own: Tensor, messages: Sequence[Message]) -> Orphans | None:
-    """Return the orphans among boxes of a score above MAX_SCORE, in the ego's levelled frame; None without any.
+def find_orphans(
+    frame: AgentFrame, boxes: Boxes, cache: PerceptionCache, messages: Sequence[Message]
+) -> Orphans | None:
+    """Return the orphans among boxes (N) in the ego's levelled frame, of a score above MAX_SCORE; None without any.
 
-    own: (K, 2) metres, what the ego proposes itself, now and before. messages: all that were fused, older ones too. Clouds propose
-    nothing until they are merged, hence with clouds no box is an orphan.
+    messages: all that were fused, older ones too. Clouds propose nothing until they are merged, hence with clouds no box is an
+    orphan.
     """
-    is_tested = boxes.score > MAX_SCORE
-    if not bool(is_tested.any()) or any(message.points is not None for message in messages):
+    if any(message.points is not None for message in messages):
         return None
     xy = boxes.center[:, :2].double().numpy()
-    is_orphan = is_tested.numpy() & (find_nearest(xy, own.double().numpy(), RADIUS_M) < 0)
-    if not is_orphan.any():
-        return None
+    own = cache.process(frame).boxes.center[:, :2].double().numpy()
+    is_orphan = (boxes.score > MAX_SCORE).numpy() & (find_nearest(xy, own, RADIUS_M) < 0)
     tokens_of = dict[int, list[Floats]]()
     for message in messages:
+        if not is_orphan.any():
+            return None
         proposed, places = _find_places(frame, message)
         is_orphan &= find_nearest(xy, proposed, RADIUS_M) < 0
         tokens_of.setdefault(message.agent_id, []).append(places)
+    if is_orphan.any():
+        is_orphan &= find_nearest(xy, _find_own_proposals(cache, frame), RADIUS_M) < 0
     if not is_orphan.any():
         return None
-    owners = {
-        agent_id: find_nearest(xy[is_orphan], np.concatenate(places), RADIUS_M) >= 0
-        for agent_id, places in tokens_of.items()
-    }
-    num_owners = sum((near.astype(np.int64) for near in owners.values()), np.zeros(int(is_orphan.sum()), np.int64))
+    orphans = xy[is_orphan]
+    owners = {a: find_nearest(orphans, np.concatenate(places), RADIUS_M) >= 0 for a, places in tokens_of.items()}
+    num_owners = sum((near.astype(np.int64) for near in owners.values()), np.zeros(len(orphans), np.int64))
     alone = {agent_id: int((near & (num_owners == 1)).sum()) for agent_id, near in owners.items()}
     return Orphans(is_orphan, frozenset(agent_id for agent_id, count in alone.items() if count >= MIN_ORPHANS))
+
+
+def _find_own_proposals(cache: PerceptionCache, frame: AgentFrame) -> Floats:
+    """Return what the ego itself proposes (N, 2), in this frame and in those before that may be fused too."""
+    found = list[Tensor]()
+    for then, output in ((frame, cache.process(frame)), *cache.previous_outputs(frame)):
+        if isinstance(output, TokenOutput):
+            seconds = (frame.timestamp_ns - then.timestamp_ns) * 1e-9
+            motion = frame.now_from_earlier(then)
+            tokens = output.shared_tokens
+            heat = proposed_heat(tokens.features[:, -PROPOSAL_DIM:])
+            found.append(token_places(tokens, seconds, motion)[torch.sigmoid(heat) >= MIN_PROPOSAL_SCORE])
+    return torch.cat(found).double().numpy() if found else np.zeros((0, 2))
 
 
 def _find_places(frame: AgentFrame, message: Message) -> tuple[Floats, Floats]:

@@ -21,7 +21,7 @@ from manyeyes.agents.trust.association import Floats
 from manyeyes.agents.trust.beta_trust import BetaTrust, TrustConfig, fusion_weight, update
 from manyeyes.agents.trust.claim_evidence import CheckedClaims, EvidenceConfig, check_claims
 from manyeyes.agents.trust.claim_offset import OffsetConfig, find_offset
-from manyeyes.agents.trust.claim_tracks import ClaimChecks, ClaimTracks, find_tracks, update_tracks
+from manyeyes.agents.trust.claim_tracks import ClaimChecks, find_tracks, update_tracks
 from manyeyes.agents.trust.copies import CopyConfig, add_contents, find_copies, is_known
 from manyeyes.agents.trust.interface import (
     AssessedClaims,
@@ -50,7 +50,7 @@ NUM_COPY_CHECKS = 5
 
 @dataclass(frozen=True)
 class _Findings:
-    """What the messages of one frame show as wholes. contradicted: senders whose stated pose is. copied: sources by their copiers."""
+    """What whole messages of one frame show. contradicted: senders whose stated pose is. copied: sources by their copiers."""
 
     contradicted: frozenset[int]
     copied: Mapping[int, int]
@@ -126,6 +126,16 @@ class RayEvidenceDetector(MisbehaviourDetector):
         return Assessment(
             tuple(assessments), claims, replace(now, senders=forget_oldest(senders), exclusions=exclusions)
         )
+
+    def record_orphans(self, state: object | None, agent_ids: Collection[int]) -> object | None:
+        """Return the state in which the trust in these senders is lower by a fault."""
+        if not isinstance(state, TrustState) or not agent_ids:
+            return state
+        senders = dict(state.senders)
+        for agent_id in agent_ids:
+            trust = update(state.trust_of(agent_id, self.trust), 0.0, self.trust.track_fault, self.trust)
+            senders[agent_id] = replace(_memory(state, agent_id), trust=trust, updated_ns=state.now_ns)
+        return replace(state, senders=senders)
 
     def _compare_messages(self, received: MisbehaviourInput, now: TrustState) -> tuple[TrustState, _Findings]:
         """Return the state with what each message as a whole shows, and that: common offsets of its claims, and copied content."""
@@ -246,7 +256,9 @@ class RayEvidenceDetector(MisbehaviourDetector):
             reason = "its claims have a common offset to the ego's detections"
             return SenderAssessment(agent_id, trust, 0.0, SenderStatus.FAULTY, reason)
         if agent_id in found.copied:
-            return SenderAssessment(agent_id, trust, 0.0, reason=f"its content is that of agent {found.copied[agent_id]}")
+            return SenderAssessment(
+                agent_id, trust, 0.0, reason=f"its content is that of agent {found.copied[agent_id]}"
+            )
         status = SenderStatus.FAULTY if is_faulty else SenderStatus.NORMAL
         reason = "its poses have an offset or a drift" if is_faulty else ""
         return SenderAssessment(agent_id, trust, fusion_weight(trust, self.trust), status, reason)
