@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exceptions of manyeyes; each text gives the expected value, the actual value, and a remedy."""
 
+from __future__ import annotations
+
 import reprlib
 
 _REPR = reprlib.Repr()
@@ -47,3 +49,8 @@ class MissingExtraError(ManyeyesError, ImportError):
         names = " and ".join(f"'{name}'" for name in extra.split(","))
         noun = "extras" if "," in extra else "extra"
         super().__init__(f"{purpose} needs the {names} {noun}: pip install 'manyeyes[{extra}]'")
+        self._arguments = extra, purpose
+
+    def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str]]:
+        # A worker process sends its errors pickled; by default they are made again from the text alone.
+        return type(self), self._arguments
