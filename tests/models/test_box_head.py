@@ -87,7 +87,7 @@ def test_half_cell_shift_of_centres_is_detected():
 def test_opposite_heading_gives_same_rectangle_and_flip_probability():
     boxes = some_boxes()
     raw = encode(boxes, every_site(4))
-    turned = RawBoxes(**{**vars(raw), "direction": -raw.direction * 0.1})
+    turned = replace(raw, direction=-raw.direction * 0.1)
     (found,), (back,) = decode(raw, DecodeConfig()), decode(turned, DecodeConfig())
     overlap = pairwise_iou(found.bev().double(), back.bev().double())
     assert torch.allclose(overlap.max(1).values, torch.ones(len(found)).double(), atol=1e-5)
@@ -105,7 +105,7 @@ def test_heading_is_continuous_at_ninety_degrees():
         for error in (-4e-3, 4e-3):
             c, s = math.cos(error), math.sin(error)
             off = torch.stack((raw.axis[:, 0] * c - raw.axis[:, 1] * s, raw.axis[:, 0] * s + raw.axis[:, 1] * c), 1)
-            (found,) = decode(RawBoxes(**{**vars(raw), "axis": off}), DecodeConfig())
+            (found,) = decode(replace(raw, axis=off), DecodeConfig())
             assert math.cos(float(found.yaw[0]) - yaw) > 0.999
             assert float(found.p_flip[0]) < 1e-3
 
@@ -134,7 +134,7 @@ def test_scores_descend_and_combine_heatmap_with_iou():
     sites = every_site(8)
     raw = encode(some_boxes(), sites)
     heat = torch.where(raw.heatmap_logit > 0, torch.linspace(0.1, 2.0, len(sites)), raw.heatmap_logit)
-    raw = RawBoxes(**{**vars(raw), "heatmap_logit": heat, "iou_logit": torch.zeros(len(sites))})
+    raw = replace(raw, heatmap_logit=heat, iou_logit=torch.zeros(len(sites)))
     (found,) = decode(raw, DecodeConfig(iou_score_weight=0.5))
     assert (found.score[:-1] >= found.score[1:]).all()
     best = torch.sigmoid(heat[raw.heatmap_logit > 0]).max()
@@ -212,9 +212,24 @@ def test_compiled_decoding_equals_decoding_by_tensors() -> None:
     rows[7, BOX_LAYOUT.log_size] = 9.0
     rows[20:23] = rows[20]
     raw = RawBoxes.of(rows, Sites(keys, grid, 2))
-    for config in (DecodeConfig(), DecodeConfig(score_threshold=0.3, max_boxes=20)):
+    configs = (
+        DecodeConfig(),
+        DecodeConfig(score_threshold=0.3, max_boxes=20),
+        DecodeConfig(score_threshold=0.0),
+        DecodeConfig(score_threshold=0.5, iou_score_weight=0.9, max_boxes=11),
+        DecodeConfig(iou_score_weight=0.0),
+    )
+    for config in configs:
         for got, want in zip(decode(raw, config), box_head._decode_by_tensors(raw, raw.heatmap_logit, config)):
             assert 10 < len(want) == len(got)
             for field in fields(Boxes):
                 a, b = getattr(got, field.name), getattr(want, field.name)
                 assert a.dtype == b.dtype and torch.allclose(a.double(), b.double(), atol=1e-5, rtol=1e-5), field.name
+
+
+def test_boxes_of_rows_give_back_these_rows_and_changed_ones_others() -> None:
+    rows = torch.randn(3, BOX_LAYOUT.total)
+    raw = RawBoxes.of(rows, Sites(torch.arange(3), BevGrid(-12.8, -12.8, -3.0, 12.8, 12.8, 5.0, 0.4, 4)))
+    assert raw.to_rows() is rows
+    changed = replace(raw, velocity=raw.velocity + 1).to_rows()
+    assert torch.equal(changed[:, :-2], rows[:, :-2]) and torch.equal(changed[:, -2:], rows[:, -2:] + 1)

@@ -4,7 +4,7 @@ import torch
 
 from manyeyes.datatypes import ShapeError
 from manyeyes.ops.box_iou import pairwise_iou
-from manyeyes.ops.nms import rotated_nms
+from manyeyes.ops.nms import find_kept, rotated_nms
 
 
 def slow_nms(boxes, score, threshold, pre=1000):
@@ -60,3 +60,14 @@ def test_rectangles_that_share_sides_and_corners():
     boxes = torch.cat((place, torch.tensor([[4.0, 2.0]]).double().expand(200, 2), quarter + 0.4), 1)
     score = torch.rand(200, generator=g)
     assert rotated_nms(boxes, score, 0.34).tolist() == slow_nms(boxes, score, 0.34)
+
+
+@pytest.mark.parametrize("max_kept", [1, 5, 17, 1000])
+def test_a_search_for_the_first_few_keeps_the_first_of_all(max_kept: int) -> None:
+    g = torch.Generator().manual_seed(7)
+    boxes = torch.rand(90, 5, generator=g, dtype=torch.float64) * torch.tensor([20, 20, 5, 3, 6.0]).double()
+    boxes[::9, 2] = 0.0
+    boxes[4] = torch.nan
+    every = find_kept(boxes.numpy(), 0.15, len(boxes)).nonzero()[0]
+    assert 17 < len(every) < 90
+    assert find_kept(boxes.numpy(), 0.15, max_kept).nonzero()[0].tolist() == every[:max_kept].tolist()

@@ -30,31 +30,42 @@ def rotated_nms(boxes: Tensor, score: Tensor, iou_threshold: float, max_candidat
             f"rotated_nms needs boxes (N, 5) and score (N,); got {tuple(boxes.shape)}, {tuple(score.shape)}."
         )
     order = score.argsort(descending=True, stable=True)[:max_candidates]
-    standing = find_kept(np.ascontiguousarray(boxes[order].double().cpu().numpy()), float(iou_threshold))
+    candidates = np.ascontiguousarray(boxes[order].double().cpu().numpy())
+    standing = find_kept(candidates, float(iou_threshold), len(candidates))
     return order[torch.from_numpy(standing).to(order.device)]
 
 
 @njit(cache=True, nogil=True)
-def find_kept(boxes: F64x2, threshold: float) -> Boolx1:  # pragma: no cover
-    """Return which of boxes (N, 5), best first, no better one that stands overlaps by more than the threshold."""
+def find_kept(boxes: F64x2, threshold: float, max_kept: int) -> Boolx1:  # pragma: no cover
+    """Return which of boxes (N, 5), best first, no better one that stands overlaps by more than the threshold.
+
+    max_kept: the search ends with so many; boxes behind the last of them are not kept.
+    """
     n = boxes.shape[0]
-    standing = np.ones(n, np.bool_)
-    solid = np.empty(n, np.bool_)
-    radius = np.empty(n)
+    standing, solid, near = np.ones(n, np.bool_), np.empty(n, np.bool_), np.empty(n, np.bool_)
+    x, y, radius = np.empty(n), np.empty(n), np.empty(n)
     for i in range(n):
         solid[i] = boxes[i, 2] > 0 and boxes[i, 3] > 0 and np.isfinite(boxes[i]).all()
         radius[i] = np.hypot(boxes[i, 2], boxes[i, 3]) / 2
+        # A comparison with NaN is false: what is not solid is near to nothing.
+        x[i], y[i] = boxes[i, 0] if solid[i] else np.nan, boxes[i, 1]
     ring, clipped = np.empty((20, 2)), np.empty((20, 2))  # a clip adds half a ring at most, however numbers round
+    kept = 0
     for i in range(n):
-        if not (standing[i] and solid[i]):
+        if not standing[i]:
             continue
+        kept += 1
+        if kept == max_kept:
+            standing[i + 1 :] = False
+            break
+        if not solid[i]:
+            continue
+        _mark_near(x[i:], y[i:], radius[i:], near[i:])
+        c, s = np.cos(boxes[i, 4]), np.sin(boxes[i, 4])
         for j in range(i + 1, n):
-            if not (standing[j] and solid[j]):
+            if not (near[j] and standing[j]):
                 continue
-            dx, dy, reach = boxes[j, 0] - boxes[i, 0], boxes[j, 1] - boxes[i, 1], radius[i] + radius[j]
-            if dx * dx + dy * dy > reach * reach:
-                continue
-            shared = _compute_shared_area(boxes[i], boxes[j], ring, clipped)
+            shared = _compute_shared_area(boxes[i], c, s, boxes[j], ring, clipped)
             union = boxes[i, 2] * boxes[i, 3] + boxes[j, 2] * boxes[j, 3] - shared
             if union > 1e-9 and shared / union > threshold:
                 standing[j] = False
@@ -62,9 +73,21 @@ def find_kept(boxes: F64x2, threshold: float) -> Boolx1:  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _compute_shared_area(a: F64x1, b: F64x1, ring: F64x2, clipped: F64x2) -> float:  # pragma: no cover
-    """Return the area that two solid boxes (5,) share; ring and clipped: (20, 2) to work in."""
-    c, s = np.cos(a[4]), np.sin(a[4])
+def _mark_near(x: F64x1, y: F64x1, radius: F64x1, near: Boolx1) -> None:  # pragma: no cover
+    """Mark circles (N,) that meet the first; without branches, so that the loop is of vectors."""
+    for j in range(np.uintp(x.shape[0])):
+        dx, dy, reach = x[j] - x[0], y[j] - y[0], radius[0] + radius[j]
+        near[j] = dx * dx + dy * dy <= reach * reach
+
+
+@njit(cache=True, nogil=True)
+def _compute_shared_area(
+    a: F64x1, c: float, s: float, b: F64x1, ring: F64x2, clipped: F64x2
+) -> float:  # pragma: no cover
+    """Return the area that two solid boxes (5,) share.
+
+    c, s: cosine and sine of the yaw of a. ring and clipped: (20, 2) to work in.
+    """
     dx, dy = b[0] - a[0], b[1] - a[1]
     x0, y0 = dx * c + dy * s, dy * c - dx * s
     ct, st = np.cos(b[4] - a[4]) / 2, np.sin(b[4] - a[4]) / 2

@@ -61,12 +61,24 @@ def _sigmoid(x: float) -> float:  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _scores(raw: F32x2, heat: F32x1, iou: int, weight: float) -> F32x1:  # pragma: no cover
-    """Return scores (N,) of raw boxes."""
-    score = np.empty(len(raw), np.float32)
+def _scores(raw: F32x2, heat: F32x1, iou: int, weight: float, threshold: float) -> F32x1:  # pragma: no cover
+    """Return scores (N,) of raw boxes; 0 where the heat alone excludes a score above the threshold."""
+    score = np.zeros(len(raw), np.float32)
+    low = _min_heat(weight, threshold)
     for i in range(len(raw)):
+        if heat[i] < low:
+            continue
         score[i] = _sigmoid(np.float64(heat[i])) ** (1.0 - weight) * _sigmoid(np.float64(raw[i, iou])) ** weight
     return score
+
+
+@njit(cache=True, nogil=True)
+def _min_heat(weight: float, threshold: float) -> float:  # pragma: no cover
+    """Return a logit below which no score exceeds the threshold, with a margin for rounding: the IoU is at most 1."""
+    if not (0.0 < threshold < 1.0 and 0.0 <= weight < 1.0):
+        return -np.inf
+    least = threshold ** (1.0 / (1.0 - weight))
+    return np.log(least / (1.0 - least)) - 1e-3
 
 
 @njit(cache=True, nogil=True)
@@ -96,7 +108,7 @@ def decode_grid(
     raw: F32x2, xy: F32x2, heat: F32x1, cell_m: float, columns: RawColumns, limits: DecodeLimits
 ) -> DecodedBoxes:  # pragma: no cover
     """Return the boxes of raw boxes (N, total) on cells at xy (N, 2), with heat logits (N,)."""
-    score = _scores(raw, heat, columns.iou, limits.iou_score_weight)
+    score = _scores(raw, heat, columns.iou, limits.iou_score_weight, limits.score_threshold)
     rows = np.flatnonzero(score > limits.score_threshold)
     rows = rows[np.argsort(-score[rows], kind="mergesort")]
     n = len(rows)
@@ -108,7 +120,7 @@ def decode_grid(
     for i in range(len(ground)):
         ground[i, 0], ground[i, 1], ground[i, 4] = found.center[i, 0], found.center[i, 1], found.yaw[i]
         ground[i, 2], ground[i, 3] = found.size[i, 0], found.size[i, 1]
-    kept = np.flatnonzero(find_kept(ground, limits.nms_iou))[: limits.max_boxes]
+    kept = np.flatnonzero(find_kept(ground, limits.nms_iou, limits.max_boxes))[: limits.max_boxes]
     return DecodedBoxes(
         found.center[kept],
         found.size[kept],

@@ -81,16 +81,21 @@ class RawBoxes:
     classes: tuple[str, ...] = VEHICLES
 
     @classmethod
-    def of(cls, rows: Tensor, sites: Sites) -> RawBoxes:
-        """Split rows (N, BOX_LAYOUT.total) into the quantities."""
+    def of(cls, rows: Tensor, sites: Sites, classes: tuple[str, ...] = VEHICLES) -> RawBoxes:
+        """Split rows (N, BOX_LAYOUT.total) into the quantities, without the heat of each class."""
         heat, offset, z, log_size, axis, direction, kind, sigma_xy, sigma_yaw, overlap, velocity = rows.split(WIDTHS, 1)
-        return cls(
+        raw = cls(
             sites, heat[:, 0], offset, z[:, 0], log_size, axis, direction, kind,
-            sigma_xy[:, 0], sigma_yaw[:, 0], overlap[:, 0], velocity,
+            sigma_xy[:, 0], sigma_yaw[:, 0], overlap[:, 0], velocity, classes=classes,
         )  # fmt: skip
+        # ``replace`` makes an object without it.
+        vars(raw)["_rows"] = rows
+        return raw
 
     def to_rows(self) -> Tensor:
-        """Concatenate all quantities to rows (N, BOX_LAYOUT.total)."""
+        """Return all quantities as rows (N, BOX_LAYOUT.total); those that they were split from are not copied."""
+        if "_rows" in vars(self):
+            return vars(self)["_rows"]
         values = (self.heatmap_logit, self.offset, self.z, self.log_size, self.axis, self.direction, self.class_logits)
         values = (*values, self.log_sigma_xy, self.log_sigma_yaw, self.iou_logit, self.velocity)
         return torch.cat([v[:, None] if v.dim() == 1 else v for v in values], 1)
@@ -187,7 +192,7 @@ class BoxHead(nn.Module):
         """Predict one raw box per site."""
         rows = self.out(self.shared(x).features)
         if len(self.classes) == 1:
-            return replace(RawBoxes.of(rows, x.sites), classes=self.classes)
+            return RawBoxes.of(rows, x.sites, self.classes)
         return _with_class_heat(rows[:, : BOX_LAYOUT.total], rows[:, BOX_LAYOUT.total :], x.sites, self.classes)
 
 
@@ -206,7 +211,7 @@ class RefineHead(nn.Module):
         """Refine proposals (N, BOX_LAYOUT.total) of the same sites."""
         residual = self.out(self.shared(x).features)
         if len(self.classes) == 1:
-            return replace(RawBoxes.of(proposals + residual, x.sites), classes=self.classes)
+            return RawBoxes.of(proposals + residual, x.sites, self.classes)
         rows = proposals + residual[:, : BOX_LAYOUT.total]
         return _with_class_heat(rows, rows[:, :1] + residual[:, BOX_LAYOUT.total :], x.sites, self.classes)
 
