@@ -22,7 +22,7 @@ def layers(channels: int, hidden: int) -> tuple[list[nn.Linear], list[nn.LayerNo
 
 
 @pytest.mark.parametrize(("channels", "hidden", "heads"), ((16, 32, 2), (64, 128, 4), (48, 16, 3)))
-@pytest.mark.parametrize("n", (1, 7, 301))
+@pytest.mark.parametrize("n", (1, 7, 301, 1500))
 @torch.no_grad()
 def test_equals_layer_after_layer(channels: int, hidden: int, heads: int, n: int) -> None:
     (query, key, value, out, up, down), (norm, norm_ffn) = layers(channels, hidden)

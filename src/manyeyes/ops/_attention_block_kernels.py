@@ -18,8 +18,11 @@ from torch import Tensor, nn
 
 from manyeyes._jit import F32x1, F32x2, F32x4, I64x1, njit
 from manyeyes.ops._sparse_conv_kernels import HAS_BFLOAT16, LANES, add_products, empty_rows, panels
-from manyeyes.ops._window_attention_kernels import FAST, WindowRuns, attend, power_of_two
+from manyeyes.ops._window_attention_kernels import WindowRuns
+from manyeyes.ops._window_softmax_kernels import FAST, attend, power_of_two
 
+CHUNK = 720
+"""Rows at once through the layers of a block, so that what lies between two layers stays in the second cache."""
 _EPS = 1e-5
 # Sine and cosine on [-pi/4, pi/4], error below 1e-7 (Taylor), and pi/2 in two parts, so that nothing is lost on taking it off.
 _SINE = tuple(map(np.float32, (-1 / 6, 1 / 120, -1 / 5040, 1 / 362880)))
@@ -106,25 +109,46 @@ def _block(
     vectors: BlockVectors,
 ) -> F32x2:  # pragma: no cover
     n, channels = x.shape
-    rows, counts = np.arange(n), np.full(1, n)
-    normed, placed = empty_rows(n, channels), empty_rows(n, channels)
-    normalize_rows(x, vectors.attention_norm_weight, vectors.attention_norm_bias, normed)
-    place_rows(normed, offsets, frequency, placed)
+    normed, placed = empty_rows(min(n, CHUNK), channels), empty_rows(min(n, CHUNK), channels)
     q, k, v = add_bias_rows(n, vectors.query), add_bias_rows(n, vectors.key), add_bias_rows(n, vectors.value)
-    add_products(placed, matrices.query, 0, 1, rows, rows, counts, q)
-    add_products(placed, matrices.key, 0, 1, rows, rows, counts, k)
-    add_products(normed, matrices.value, 0, 1, rows, rows, counts, v)
-    attend(q.reshape(-1), k.reshape(-1), v.reshape(-1), placed.reshape(-1), heads, channels // heads, order, start)
+    for a in range(0, n, CHUNK):
+        b = min(a + CHUNK, n)
+        there, here = normed[: b - a], placed[: b - a]
+        normalize_rows(x[a:b], vectors.attention_norm_weight, vectors.attention_norm_bias, there)
+        place_rows(there, offsets[a:b], frequency, here)
+        add_linear(here, matrices.query, q[a:b])
+        add_linear(here, matrices.key, k[a:b])
+        add_linear(there, matrices.value, v[a:b])
+    # A head's queries of a tile are read before its results are written.
+    attend(q.reshape(-1), k.reshape(-1), v.reshape(-1), q.reshape(-1), heads, channels // heads, order, start)
     out = empty_rows(n, channels)
     out[:] = x + vectors.output
-    add_products(placed, matrices.output, 0, 1, rows, rows, counts, out)
-    normalize_rows(out, vectors.feed_forward_norm_weight, vectors.feed_forward_norm_bias, normed)
-    hidden = add_bias_rows(n, vectors.hidden)
-    add_products(normed, matrices.hidden, 0, 1, rows, rows, counts, hidden)
-    apply_gelu(hidden.reshape(-1))
-    out += vectors.feed_forward
-    add_products(hidden, matrices.feed_forward, 0, 1, rows, rows, counts, out)
+    for a in range(0, n, CHUNK):
+        b = min(a + CHUNK, n)
+        there, some = normed[: b - a], out[a:b]
+        add_linear(q[a:b], matrices.output, some)
+        normalize_rows(some, vectors.feed_forward_norm_weight, vectors.feed_forward_norm_bias, there)
+        add_feed_forward(there, matrices, vectors.hidden, vectors.feed_forward, some)
     return out
+
+
+@njit(cache=True, nogil=True)
+def add_linear(x: F32x2, weight: F32x4, out: F32x2) -> None:  # pragma: no cover
+    """out (N, D) += x (N, C) times the ``panels`` of a matrix."""
+    rows = np.arange(x.shape[0])
+    add_products(x, weight, 0, 1, rows, rows, np.full(1, x.shape[0]), out)
+
+
+@njit(cache=True, nogil=True)
+def add_feed_forward(
+    x: F32x2, matrices: BlockMatrices, hidden_bias: F32x1, bias: F32x1, out: F32x2
+) -> None:  # pragma: no cover
+    """out (N, C) += the feed-forward network of x (N, C)."""
+    hidden = add_bias_rows(x.shape[0], hidden_bias)
+    add_linear(x, matrices.hidden, hidden)
+    apply_gelu(hidden.reshape(-1))
+    out += bias
+    add_linear(hidden, matrices.feed_forward, out)
 
 
 @njit(cache=True, nogil=True)

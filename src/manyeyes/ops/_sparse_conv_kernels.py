@@ -37,7 +37,9 @@ _AHEAD = 2048
 """So many bytes ahead a panel is fetched from the second cache: some hundred cycles of products."""
 _LINE = 64
 """Bytes of a line of the cache."""
-HAS_BFLOAT16 = bool(_WIDEST > LANES and binding.get_host_cpu_features().get("avx512bf16", False))
+HAS_WIDE_TILES = _WIDEST > LANES
+"""Whether the sums of a tile of 6 x 4 vectors stay in registers."""
+HAS_BFLOAT16 = bool(HAS_WIDE_TILES and binding.get_host_cpu_features().get("avx512bf16", False))
 """Whether this processor has products of bfloat16."""
 _FRACTION = 1024
 """Shares of bytes are counted in such fractions."""
@@ -181,22 +183,22 @@ def _panel(vectors: int) -> Any:
         share, fetched = 4 * vectors * LANES * _FRACTION // max(tiles, 1), 0
         if end - at >= _MANY and panel.size <= _NEAR:
             for p in range(at, sixes, 6):
-                _add_tile(6, vectors, False, x, panel, following, fetched, share, source, target, p, column, out)
+                add_tile(6, vectors, False, x, panel, following, fetched, share, source, target, p, column, out)
         else:
             for p in range(at, sixes, 6):
-                _add_tile(6, vectors, True, x, panel, following, fetched, share, source, target, p, column, out)
+                add_tile(6, vectors, True, x, panel, following, fetched, share, source, target, p, column, out)
                 fetched += share * x.shape[1]
         rest = end - sixes
         if rest == 5:
-            _add_tile(5, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
+            add_tile(5, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
         elif rest == 4:
-            _add_tile(4, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
+            add_tile(4, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
         elif rest == 3:
-            _add_tile(3, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
+            add_tile(3, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
         elif rest == 2:
-            _add_tile(2, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
+            add_tile(2, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
         elif rest == 1:
-            _add_tile(1, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
+            add_tile(1, vectors, True, x, panel, following, fetched, share, source, target, sixes, column, out)
 
     return add
 
@@ -308,5 +310,5 @@ def _tile(
     return types.void(*kinds), generate
 
 
-_add_tile: Any = intrinsic(prefer_literal=True)(_tile)
+add_tile: Any = intrinsic(prefer_literal=True)(_tile)
 _add_one, _add_two, _add_four = _panel(1), _panel(2), _panel(4)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from manyeyes._jit import F32x1, I64x1, Uintpx1, njit
 from manyeyes.datatypes import ShapeError
+from manyeyes.ops._window_softmax_kernels import FAST, attend, power_of_two
 
 _TILE = 64
 _VECTOR = 16
@@ -25,13 +26,8 @@ _VECTOR = 16
 _ROW = np.uintp(_TILE)
 _ONE, _TWO, _THREE = np.uintp(1), np.uintp(2), np.uintp(3)
 _TWO_ROWS, _THREE_ROWS = np.uintp(2 * _TILE), np.uintp(3 * _TILE)
-# 2^f on [-1/2, 1/2]: the least squares of the relative error at 2000 Chebyshev nodes.
-_POWERS = tuple(
-    map(np.float32, (1, 0.693147206, 0.240226466, 0.05550329, 0.00961851953, 0.00133998604, 0.000153375768))
-)
 _Four = tuple[np.float32, np.float32, np.float32, np.float32]
 _Block = tuple[_Four, _Four, _Four, _Four]
-FAST = {"contract", "nsz", "nnan", "ninf", "arcp", "reassoc"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,62 +112,6 @@ def _flat(*tensors: Tensor) -> list[F32x1]:
     return [t.detach().contiguous().view(-1).numpy() for t in tensors]
 
 
-@njit(cache=True, nogil=True)
-def attend(
-    q: F32x1, k: F32x1, v: F32x1, out: F32x1, heads: int, width: int, order: I64x1, start: I64x1
-) -> None:  # pragma: no cover
-    """Window by window and head by head, as many queries at once as a tile holds."""
-    attend_across(q, k, v, out, heads, width, order, start, order, start)
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def attend_across(
-    q: F32x1,
-    k: F32x1,
-    v: F32x1,
-    out: F32x1,
-    heads: int,
-    width: int,
-    order: I64x1,
-    start: I64x1,
-    key_order: I64x1,
-    key_start: I64x1,
-) -> None:  # pragma: no cover
-    """As :func:`attend`, of queries to other tokens; both have the same windows, none of them empty."""
-    max_queries, max_keys = 4, 4
-    for w in range(start.shape[0] - 1):
-        max_queries = max(max_queries, (start[w + 1] - start[w] + 3) // 4 * 4)
-        max_keys = max(max_keys, (key_start[w + 1] - key_start[w] + 3) // 4 * 4)
-    rows, key_rows = np.empty(max_queries, np.uintp), np.empty(max_keys, np.uintp)
-    # With a column for each query.
-    queries, mixed = np.empty(width * _TILE, np.float32), np.empty(width * _TILE, np.float32)
-    weights, sums = np.empty(max_keys * _TILE, np.float32), np.empty(2 * _TILE, np.float32)
-    scale = np.float32(math.log2(math.e) / math.sqrt(width))
-    for w in range(start.shape[0] - 1):
-        n, keys = start[w + 1] - start[w], key_start[w + 1] - key_start[w]
-        padded = (keys + 3) // 4 * 4
-        # Up to a multiple of four the last token stands again, and is given no weight.
-        for j in range((n + 3) // 4 * 4):
-            rows[j] = np.uintp(order[start[w] + min(j, n - 1)] * heads * width)
-        for j in range(padded):
-            key_rows[j] = np.uintp(key_order[key_start[w] + min(j, keys - 1)] * heads * width)
-        for _ in range(heads):
-            for at in range(0, n, _TILE):
-                count = min(n - at, _TILE)
-                wide = (count + _VECTOR - 1) // _VECTOR * _VECTOR
-                some = rows[at : at + (count + 3) // 4 * 4]
-                _gather(q, some, width, wide, scale, queries)
-                _scores(k, key_rows, queries, weights, padded, width, wide)
-                weights[keys * _TILE : padded * _TILE] = np.float32(-1e30)
-                _exponentials(weights, padded, wide, sums)
-                _mix(v, key_rows, weights, mixed, padded, width, wide)
-                _scatter(mixed, sums, some, width, out)
-            for j in range((n + 3) // 4 * 4):
-                rows[j] += np.uintp(width)
-            for j in range(padded):
-                key_rows[j] += np.uintp(width)
-
-
 @njit(cache=True, nogil=True, fastmath=FAST)
 def _gather(
     x: F32x1, rows: Uintpx1, width: int, wide: int, scale: np.float32, columns: F32x1
@@ -185,15 +125,6 @@ def _gather(
             columns[to], columns[to + _ONE], columns[to + _TWO], columns[to + _THREE] = w, y, z, t
     for c in range(width):
         columns[c * _TILE + rows.shape[0] : c * _TILE + wide] = np.float32(0.0)
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def _scatter(columns: F32x1, sums: F32x1, rows: Uintpx1, width: int, out: F32x1) -> None:  # pragma: no cover
-    """out[rows[i] + c] = columns[c, i] / sums[1, i]."""
-    for i in range(rows.shape[0]):
-        at, to, share = np.uintp(i), rows[i], np.float32(1.0) / sums[_TILE + i]
-        for c in range(np.uintp(width)):
-            out[to + c] = columns[at + c * _ROW] * share
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
@@ -271,18 +202,6 @@ def _exponentials(x: F32x1, rows: int, wide: int, sums: F32x1) -> None:  # pragm
             d, e = power_of_two(x[o + _TWO_ROWS + i] - top), power_of_two(x[o + _THREE_ROWS + i] - top)
             x[o + i], x[o + _ROW + i], x[o + _TWO_ROWS + i], x[o + _THREE_ROWS + i] = a, b, d, e
             sums[_ROW + i] += (a + b) + (d + e)
-
-
-@njit(cache=True, nogil=True, fastmath=FAST)
-def power_of_two(x: np.float32) -> np.float32:  # pragma: no cover
-    """2^x of x <= 0 within 2e-7 of it; below -126 as of -126."""
-    x = max(x, np.float32(-126.0))
-    whole = np.rint(x)
-    f = x - whole
-    y = _POWERS[6]
-    for n in (5, 4, 3, 2, 1, 0):
-        y = y * f + _POWERS[n]
-    return y * np.int32((np.int32(whole) + np.int32(127)) << np.int32(23)).view(np.float32)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)

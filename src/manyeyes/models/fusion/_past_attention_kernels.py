@@ -12,14 +12,16 @@ import numpy as np
 
 from manyeyes._jit import F32x1, F32x2, I64x1, njit
 from manyeyes.ops._attention_block_kernels import (
+    CHUNK,
     BlockMatrices,
     add_bias_rows,
-    apply_gelu,
+    add_feed_forward,
+    add_linear,
     normalize_rows,
     place_rows,
 )
-from manyeyes.ops._sparse_conv_kernels import add_products, empty_rows
-from manyeyes.ops._window_attention_kernels import attend_across
+from manyeyes.ops._sparse_conv_kernels import empty_rows
+from manyeyes.ops._window_softmax_kernels import attend_across
 
 
 class PastVectors(NamedTuple):
@@ -95,29 +97,30 @@ def attend_past(
     n, m, channels = chosen.shape[0], known.shape[0], out.shape[1]
     if n == 0:
         return out
-    rows, counts, past_rows, past_counts = np.arange(n), np.full(1, n), np.arange(m), np.full(1, m)
+    rows, past_rows = np.arange(n), np.arange(m)
     x, offsets = _gather(tokens.features, tokens.offsets, chosen)
     y, past_offsets = _gather(past.features, past.offsets, known)
-    normed, placed = empty_rows(n, channels), empty_rows(n, channels)
-    normalize_rows(x, vectors.norm_weight, vectors.norm_bias, normed)
-    place_rows(normed, offsets, frequency, placed)
-    past_normed, past_placed = empty_rows(m, channels), empty_rows(m, channels)
-    normalize_rows(y, vectors.past_norm_weight, vectors.past_norm_bias, past_normed)
-    place_rows(past_normed, past_offsets, frequency, past_placed)
+    normed, placed = empty_rows(max(m, min(n, CHUNK)), channels), empty_rows(max(m, min(n, CHUNK)), channels)
     q, k, v = add_bias_rows(n, vectors.query), add_bias_rows(m, vectors.key), add_bias_rows(m, vectors.value)
-    add_products(placed, matrices.query, 0, 1, rows, rows, counts, q)
-    add_products(past_placed, matrices.key, 0, 1, past_rows, past_rows, past_counts, k)
-    add_products(past_normed, matrices.value, 0, 1, past_rows, past_rows, past_counts, v)
-    width = channels // heads
-    flat_q, flat_k, flat_v, mixed = q.reshape(-1), k.reshape(-1), v.reshape(-1), placed.reshape(-1)
-    attend_across(flat_q, flat_k, flat_v, mixed, heads, width, rows, start, past_rows, past_start)
-    add_products(placed, matrices.output, 0, 1, rows, rows, counts, x)
-    normalize_rows(x, vectors.feed_forward_norm_weight, vectors.feed_forward_norm_bias, normed)
-    hidden = add_bias_rows(n, vectors.hidden)
-    add_products(normed, matrices.hidden, 0, 1, rows, rows, counts, hidden)
-    apply_gelu(hidden.reshape(-1))
-    x += vectors.feed_forward
-    add_products(hidden, matrices.feed_forward, 0, 1, rows, rows, counts, x)
+    normalize_rows(y, vectors.past_norm_weight, vectors.past_norm_bias, normed[:m])
+    place_rows(normed[:m], past_offsets, frequency, placed[:m])
+    add_linear(placed[:m], matrices.key, k)
+    add_linear(normed[:m], matrices.value, v)
+    for a in range(0, n, CHUNK):
+        b = min(a + CHUNK, n)
+        there, here = normed[: b - a], placed[: b - a]
+        normalize_rows(x[a:b], vectors.norm_weight, vectors.norm_bias, there)
+        place_rows(there, offsets[a:b], frequency, here)
+        add_linear(here, matrices.query, q[a:b])
+    flat_q, flat_k, flat_v = q.reshape(-1), k.reshape(-1), v.reshape(-1)
+    # A head's queries of a tile are read before its results are written.
+    attend_across(flat_q, flat_k, flat_v, flat_q, heads, channels // heads, rows, start, past_rows, past_start)
+    for a in range(0, n, CHUNK):
+        b = min(a + CHUNK, n)
+        there, some = normed[: b - a], x[a:b]
+        add_linear(q[a:b], matrices.output, some)
+        normalize_rows(some, vectors.feed_forward_norm_weight, vectors.feed_forward_norm_bias, there)
+        add_feed_forward(there, matrices, vectors.hidden, vectors.feed_forward, some)
     for i in range(n):
         out[chosen[i]] = x[i]
     return out
