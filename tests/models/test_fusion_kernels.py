@@ -20,6 +20,7 @@ from manyeyes.models.fusion.transform_tokens import (
     TOKEN_COLUMNS,
     AgentTokens,
     Tokens,
+    are_last_rows,
     split_last,
     to_ego_frame,
 )
@@ -149,3 +150,18 @@ def test_tokens_without_past_in_their_window_stay() -> None:
     with torch.inference_mode():
         assert torch.equal(layer(tokens.features, tokens, far.features, far), tokens.features)
         assert not torch.equal(layer(tokens.features, tokens, near.features, near), tokens.features)
+
+
+def test_the_past_among_the_tokens_is_encoded_once_and_alike() -> None:
+    tokens = to_ego_frame([*parts()[:3], *own_past()], GRID, 1)
+    past = split_last(tokens, 3)
+    copied = replace(past, **{name: getattr(past, name).clone() for name in TOKEN_COLUMNS})
+    assert len(past.xy) > 20 and are_last_rows(past, tokens) and not are_last_rows(copied, tokens)
+    layer, counts = FastFusion(CHANNELS, CONFIG), list[int]()
+    draw_weights(layer)
+    layer.encoding.register_forward_hook(lambda module, given, out: counts.append(len(out)))
+    with torch.inference_mode():
+        got, want = layer(tokens, past), layer(tokens, copied)
+    assert counts == [len(tokens.xy), len(tokens.xy), len(past.xy)]
+    assert torch.allclose(got.bev.features, want.bev.features, atol=1e-5)
+    assert torch.allclose(got.merged_proposals, want.merged_proposals, atol=1e-5)

@@ -17,7 +17,7 @@ from manyeyes.models.fusion._past_attention_kernels import PastVectors, WindowTo
 from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
 from manyeyes.models.fusion.registry import register_fusion
 from manyeyes.models.fusion.token_merge import FusedBev, TokenMerge, assign_cells
-from manyeyes.models.fusion.transform_tokens import Tokens, is_plain
+from manyeyes.models.fusion.transform_tokens import Tokens, are_last_rows, is_plain
 from manyeyes.ops._attention_block_kernels import BlockMatrices, BlockWeights
 from manyeyes.ops.window_attention import (
     plan_windows,
@@ -129,8 +129,12 @@ class FastFusion(nn.Module):
     def forward(self, tokens: Tokens, past: Tokens | None = None) -> FusedBev:
         """Fuse the tokens of all agents and the ego's past tokens to one feature and one box per cell."""
         key, place = assign_cells(tokens)
-        attended = self.transformer(self.encoding(tokens.features, tokens, place), tokens.xy, tokens.ego, tokens.grid)
+        placed = self.encoding(tokens.features, tokens, place)
+        attended = self.transformer(placed, tokens.xy, tokens.ego, tokens.grid)
         if past is not None and len(past.features):
-            past_features = self.encoding(past.features, past, assign_cells(past)[1])
+            if are_last_rows(past, tokens):
+                past_features = placed[-len(past.features) :]
+            else:
+                past_features = self.encoding(past.features, past, assign_cells(past)[1])
             attended = self.past_attention(attended, tokens, past_features, past)
         return self.merge(attended, tokens, key, place)

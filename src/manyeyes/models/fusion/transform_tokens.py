@@ -198,6 +198,16 @@ def split_last(tokens: Tokens, num_parts: int) -> Tokens:
     return Tokens(**columns | {"sender": columns["sender"] - (num_parts - 1)}, grid=tokens.grid, batch_size=1)
 
 
+def are_last_rows(some: Tokens, tokens: Tokens) -> bool:
+    """Return whether tokens are views of the last rows of others, as ``split_last`` makes them: their encodings are equal."""
+    first = len(tokens.features) - len(some.features)
+    is_on_cpu = some.features.device.type == tokens.features.device.type == "cpu"
+    if not is_on_cpu or first < 0 or some.grid != tokens.grid or (some.batch_size, tokens.batch_size) != (1, 1):
+        return False
+    names = ("features", "xy", "pose_context", "proposal")
+    return all(getattr(some, n).data_ptr() == getattr(tokens, n)[first:].data_ptr() for n in names)
+
+
 def _transform_in_loops(
     parts: Sequence[AgentTokens], tokens: Tensor, xy: Tensor, grid: BevGrid, batch_size: int
 ) -> Tokens:
