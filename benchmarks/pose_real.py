@@ -222,6 +222,17 @@ TABLES: dict[str, tuple[Callable[[int, Correct], Iterator[Line]], int]] = {
 """Tables and the number of scenes of each of their lines."""
 
 
+def write_lines(out: Path, benchmark: str, lines: Sequence[Line], seed: int) -> None:
+    """Write the lines of a benchmark with its command."""
+    command = f"python -m benchmarks.{benchmark} {shlex.join(sys.argv[1:])}".strip()
+    write_json(
+        out,
+        {"benchmark": benchmark, "command": command, "lines": [asdict(line) for line in lines]},
+        {"command": command},
+        seed,
+    )
+
+
 def main() -> None:
     """The benchmark."""
     parser = argparse.ArgumentParser()
@@ -237,8 +248,7 @@ def main() -> None:
             sys.stdout.write(f"{line}\n")
             sys.stdout.flush()
             lines.append(line)
-    command = f"python -m benchmarks.pose_real {shlex.join(sys.argv[1:])}".strip()
-    write_json(options.out, {"lines": [asdict(line) for line in lines]}, {"command": command}, SEED)
+    write_lines(options.out, "pose_real", lines, SEED)
 
 
 if __name__ == "__main__":

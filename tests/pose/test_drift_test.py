@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from manyeyes.pose.drift_test import CORRELATIONS, find_drift
+from manyeyes.pose.drift_test import CORRELATIONS, DriftTest, find_drift
+from manyeyes.pose.pose_monitor import PoseMonitorConfig
 
 
 def make_noise(runs: int, frames: int, autocorrelation: float, seed: int) -> np.ndarray:
@@ -86,5 +87,12 @@ def test_drifts_of_thirteen_tenths_of_the_oracle_are_detected_in_thirty_frames(
     sound = find_drift(residuals, time_s, np.full(3, 0.09), 10)
     residuals[:, :, 1] += 1.3 * slope * np.maximum(time_s - time_s[99], 0.0)
     found = find_drift(residuals, time_s, np.full(3, 0.09), 10)
-    assert np.mean(found.sigmas > 4.9) >= 0.93 and np.mean(sound.sigmas > 4.9) == 0
+    config = PoseMonitorConfig()
+    assert np.mean(config.is_drift(found)) >= 0.93 and not config.is_drift(sound).any()
     assert np.median(found.slope[:, 1]) == pytest.approx(1.3 * slope, rel=0.25)
+
+
+def test_the_limit_of_a_drift_is_lower_for_strongly_correlated_errors() -> None:
+    sigmas, correlation = np.array([5.0, 5.0, 5.3, 4.8]), np.array([0.7, 0.8, 0.0, 0.95])
+    found = DriftTest(sigmas, np.zeros((4, 3)), correlation)
+    assert PoseMonitorConfig().is_drift(found).tolist() == [False, True, True, False]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.pose.corrector import CHI2_3DOF_P001, CHI2_3DOF_P05
-from manyeyes.pose.drift_test import find_drift
+from manyeyes.pose.drift_test import DriftTest, find_drift
 from manyeyes.pose.types import PoseEstimate, PosePrior, pose_difference
 
 Floats = NDArray[np.float64]
@@ -41,8 +41,10 @@ class PoseHealth(Enum):
 class PoseMonitorConfig:
     """max_frames: measured frames in memory. offset_window: frames over which an offset is averaged. min_drift_frames: frames that
     a drift lasts at least; twice as many are measured before it is tested. offset_gate, suspect_gate: limits of squared distances,
-    16.27 is p = 0.001 of one frame. drift_gate_sigmas: limit of the drift; at 4.9, about one sound agent in a hundred is
-    reported in half a minute at 10 Hz, whatever the autocorrelation of its errors (benchmarks/pose_drift.py).
+    16.27 is p = 0.001 of one frame. drift_gate_sigmas: limit of the drift; correlated_drift_gate_sigmas: the same where the
+    estimated autocorrelation is at least min_high_correlation: such a window has fewer independent residuals, so that the largest
+    of its frames and begins is smaller. At most one sound agent in a hundred is reported in half a minute at 10 Hz, whatever the
+    autocorrelation of its errors (benchmarks/pose_drift.py).
     """
 
     max_frames: int = 200
@@ -50,14 +52,22 @@ class PoseMonitorConfig:
     min_drift_frames: int = 10
     offset_gate: float = CHI2_3DOF_P001
     suspect_gate: float = CHI2_3DOF_P05
-    drift_gate_sigmas: float = 4.9
+    drift_gate_sigmas: float = 5.2
+    correlated_drift_gate_sigmas: float = 4.9
+    min_high_correlation: float = 0.75
 
     def __post_init__(self) -> None:
         fits = 3 <= self.min_drift_frames <= self.max_frames and 1 <= self.offset_window <= self.max_frames
-        if not fits or min(self.offset_gate, self.suspect_gate, self.drift_gate_sigmas) <= 0:
+        gates = self.offset_gate, self.suspect_gate, self.drift_gate_sigmas, self.correlated_drift_gate_sigmas
+        if not fits or min(gates) <= 0:
             raise ConfigError(
                 "PoseMonitorConfig needs 3 <= min_drift_frames <= max_frames, 1 <= offset_window <= max_frames and gates above 0."
             )
+
+    def is_drift(self, found: DriftTest) -> NDArray[np.bool_]:
+        """Return (...) bool: whether tests exceed the limit of their autocorrelation."""
+        is_high = found.correlation >= self.min_high_correlation
+        return found.sigmas > np.where(is_high, self.correlated_drift_gate_sigmas, self.drift_gate_sigmas)
 
 
 @dataclass(frozen=True)
@@ -121,10 +131,11 @@ def _report(state: PoseMonitorState, config: PoseMonitorConfig) -> PoseReport:
     if not n:
         return PoseReport(PoseHealth.UNKNOWN, float("nan"), np.zeros(3), 0.0, 0)
     stated = np.diagonal(state.measured_covariance, axis1=1, axis2=2).mean(0)
-    drift, sigmas, correlation = np.zeros(3), 0.0, float("nan")
+    drift, sigmas, correlation, is_drifting = np.zeros(3), 0.0, float("nan"), False
     if n >= max(2 * config.min_drift_frames, 3):
         found = find_drift(state.innovation, state.time_s, stated, config.min_drift_frames)
         drift, sigmas, correlation = found.slope, float(found.sigmas), float(found.correlation)
+        is_drifting = bool(config.is_drift(found))
     now = _distance(state.innovation[-1], state.measured_covariance[-1] + state.prior_covariance[-1])
     # The prior's error may be common to all frames, so that only the measurements average out.
     weight = np.linalg.inv(state.measured_covariance[-config.offset_window :])
@@ -136,7 +147,7 @@ def _report(state: PoseMonitorState, config: PoseMonitorConfig) -> PoseReport:
     health = PoseHealth.SUSPECT if now > config.suspect_gate else PoseHealth.SOUND
     if max(now, mean_distance) > config.offset_gate:
         health = PoseHealth.OFFSET
-    if sigmas > config.drift_gate_sigmas:
+    if is_drifting:
         health = PoseHealth.DRIFTING
     return PoseReport(health, max(now, mean_distance), drift, sigmas, n, correlation)
 

@@ -48,7 +48,7 @@ class ReplayOptions:
     pose_correction: str | None = None
     """Correct the poses of senders before fusion, by objects that both agents detect; leave out messages without a usable pose.
     Corrector: voting, feakm, a .safetensors file of FeaKM, or a baseline: identity, coalign, fpv-rcnn, feaco, icp, vips,
-    v2x-reg-odist, v2x-reg-oiou, mash."""
+    clipper, max-clique, v2x-reg-odist, v2x-reg-oiou, mash."""
     misbehaviour: str | None = None
     """Weigh senders by trust: ray-evidence, or a baseline: none, oracle, robosac, cp-guard; a name of your own too."""
 
