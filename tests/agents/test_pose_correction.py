@@ -16,7 +16,7 @@ from manyeyes.agents.agent import Agent
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.pose_correction import MessageUse, PoseCorrection, extract_message_boxes
 from manyeyes.agents.strategies.late import LateFusion
-from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, Message, PointCloud, SparseBev, Transform
+from manyeyes.datatypes import AgentBody, AgentFrame, Boxes, ConfigError, Message, PointCloud, SparseBev, Transform
 from manyeyes.models.detector.box_head import BOX_LAYOUT, DecodeConfig, RawBoxes, decode
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
@@ -333,7 +333,7 @@ def test_the_state_of_a_sender_that_left_expires() -> None:
 def test_no_messages_and_unknown_correctors() -> None:
     found = PoseCorrection().correct(frame(), cache_of(cars(5, 0)), [], {})
     assert (found.messages, found.corrections, dict(found.states)) == ((), (), {})
-    with pytest.raises(ConfigError, match=r"known: coalign, .*voting"):
+    with pytest.raises(ConfigError, match=r"known: clipper, coalign, .*voting"):
         PoseCorrection(corrector="magic")
 
 
@@ -364,3 +364,22 @@ def test_vehicles_that_detect_each_other_are_landmarks() -> None:
     for pole, late_ns in ((True, 0), (False, 100_000_000)):
         (verdict,) = mutual_detection(pole, late_ns)[0].corrections
         assert verdict.estimate.inliers < 3
+
+
+def test_bodies_that_are_not_stated_are_estimated_over_time_of_senders_and_of_the_ego() -> None:
+    """Both agents detect ten cars and each other; the middles are 1.5 m ahead of the frames' origins."""
+    world, body = cars(10, 12), AgentBody.standing(1.5, 0.0, (4.5, 1.9, 1.6))
+    sender, ego = (body.boxes(torch.float64).transform(pose) for pose in (OTHERS[0], EGO))
+    states: Any = {}
+    for n in range(4):
+        message = message_of(Boxes.cat([world, ego]), OTHERS[0], sigma=0.2, time_ns=n * 1_000_000_000)
+        cache = cache_of(Boxes.cat([world, sender]))
+        stated = PoseCorrection().correct(frame(n * 1_000_000_000), cache, [replace(message, body=body)], {}).states
+        states = PoseCorrection().correct(frame(n * 1_000_000_000), cache, [message], states).states
+        assert stated[2].body is None and stated[1].body is not None
+    for agent in (1, 2):
+        found = states[agent].body
+        assert found is not None and found.num_measurements == 4 and found.sigma_m() < 0.25
+        np.testing.assert_allclose(found.xy, [1.5, 0.0], atol=0.1)
+    # A minute without measurements ends the estimate.
+    assert not PoseCorrection().correct(frame(70_000_000_000), cache_of(world), [], states).states

@@ -31,6 +31,7 @@ from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.models.detector.box_head import RawBoxes
 from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.pose.feakm import FeakmNet
+from manyeyes.pose.body_estimate import BodyEstimate, append_body, update_body
 from manyeyes.pose.corrector import inflate_covariance
 from manyeyes.pose.feakm import FeakmCorrector
 from manyeyes.pose.landmarks import Landmarks
@@ -92,19 +93,23 @@ class CorrectionOutcome:
 
 @dataclass(frozen=True)
 class SenderState:
-    """State of one sender. last_corrected: its last message with a corrected pose that is consistent with the prior."""
+    """State of one sender, or of the ego itself. last_corrected: its last message with a corrected pose that is consistent with the
+    prior. body: where its vehicle is in its frame, estimated where it is not stated.
+    """
 
     monitor: PoseMonitorState
     last_corrected: Message | None = None
+    body: BodyEstimate | None = None
 
     def drop_expired(self, now_s: float, max_message_age_s: float) -> SenderState | None:
-        """Return the state without a monitor silent for MAX_SILENCE_S or an older message; None if neither is left."""
+        """Return the state without a monitor or body silent for MAX_SILENCE_S or an older message; None if nothing is left."""
         time_s, last = self.monitor.time_s, self.last_corrected
         is_silent = not len(time_s) or abs(now_s - time_s[-1]) > MAX_SILENCE_S
         is_old = last is None or abs(now_s - last.timestamp_ns * 1e-9) > max_message_age_s
-        if is_silent and is_old:
+        body = self.body if self.body is not None and abs(now_s - self.body.time_s) <= MAX_SILENCE_S else None
+        if is_silent and is_old and body is None:
             return None
-        return SenderState(PoseMonitorState.new() if is_silent else self.monitor, None if is_old else last)
+        return SenderState(PoseMonitorState.new() if is_silent else self.monitor, None if is_old else last, body)
 
 
 @dataclass(frozen=True)
@@ -157,8 +162,12 @@ class PoseCorrection:
         new_states = {a: s for a, s in current.items() if s is not None}
         if not messages:
             return CorrectedMessages((), (), new_states)
-        own = self.extract_own_landmarks(frame, cache)
-        landmarks = [self._message_landmarks(cache, message, age_s(frame, message)) for message in messages]
+        bodies = {agent: state.body for agent, state in new_states.items()}
+        own = self.extract_own_landmarks(frame, cache, bodies.get(frame.agent_id))
+        landmarks = [
+            self._message_landmarks(cache, message, age_s(frame, message), bodies.get(message.agent_id))
+            for message in messages
+        ]
         priors = [_make_prior(frame, message) for message in messages]
         pairwise_estimates = [
             load_corrector(self.corrector)(own, theirs, prior) for theirs, prior in zip(landmarks, priors)
@@ -169,7 +178,7 @@ class PoseCorrection:
             state, report = self._update_monitor(before.monitor if before else None, message, prior, pairwise)
             # The last entries are those of the last received senders.
             new_states.pop(message.agent_id, None)
-            new_states[message.agent_id] = SenderState(state)
+            new_states[message.agent_id] = SenderState(state, body=bodies.get(message.agent_id))
             health.append(report)
         propagated = set[int]()
         for n, message in enumerate(messages):
@@ -185,6 +194,7 @@ class PoseCorrection:
                     load_corrector(self.corrector)(own, landmarks[n], propagated_prior),
                 )
                 propagated.add(n)
+        bodies = self._update_bodies(frame, messages, (own, *landmarks), pairwise_estimates, bodies)
         joint, inconsistent = self._optimize_jointly(messages, (own, *landmarks), priors, pairwise_estimates)
         kept, corrections = [], []
         for n, message in enumerate(messages):
@@ -202,7 +212,14 @@ class PoseCorrection:
             # Do not propagate from a pose that conflicts with the prior: an error would persist.
             refuted = use is MessageUse.INCONSISTENT or estimate.status is PoseStatus.CONFLICT
             put = kept[-1] if use is MessageUse.CORRECTED else last_corrected.get(message.agent_id)
-            new_states[message.agent_id] = SenderState(new_states[message.agent_id].monitor, None if refuted else put)
+            new_states[message.agent_id] = replace(
+                new_states[message.agent_id],
+                last_corrected=None if refuted else put,
+                body=bodies.get(message.agent_id),
+            )
+        if bodies.get(frame.agent_id) is not None:
+            before = new_states.pop(frame.agent_id, SenderState(PoseMonitorState.new()))
+            new_states[frame.agent_id] = replace(before, body=bodies[frame.agent_id])
         return CorrectedMessages(tuple(kept), tuple(corrections), dict([*new_states.items()][-MAX_SENDER_STATES:]))
 
     @property
@@ -217,22 +234,52 @@ class PoseCorrection:
             return message
         return attach_descriptors(self.net, cache, frame, message)
 
-    def extract_own_landmarks(self, frame: AgentFrame, cache: PerceptionCache) -> Landmarks:
-        """Return landmarks of an agent's own frame for the corrector."""
+    def extract_own_landmarks(
+        self, frame: AgentFrame, cache: PerceptionCache, body: BodyEstimate | None = None
+    ) -> Landmarks:
+        """Return landmarks of an agent's own frame for the corrector; body: of its vehicle, used where the frame states none."""
         if self.net is None:
             landmarks = self._select_landmarks(cache.process(frame).boxes, None, 0.0)
-            return landmarks if frame.is_infrastructure else landmarks.with_body(frame.body)
+            return landmarks if frame.is_infrastructure else append_body(landmarks, frame.body, body)
         points = extract_own_keypoints(self.net, cache, frame)
         return self._select_landmarks(points.boxes, points.descriptor, 0.0)
 
-    def _message_landmarks(self, cache: PerceptionCache, message: Message, seconds: float) -> Landmarks:
+    def _message_landmarks(
+        self, cache: PerceptionCache, message: Message, seconds: float, body: BodyEstimate | None = None
+    ) -> Landmarks:
         """Return landmarks of a message of that age; none if the corrector needs descriptors and the message has none."""
         if self.net is None:
             landmarks = self._select_landmarks(extract_message_boxes(cache, message), None, seconds)
             # An older message does not give the sender's own position now: its velocity is not sent.
-            return landmarks if message.is_infrastructure or seconds else landmarks.with_body(message.body)
+            return landmarks if message.is_infrastructure or seconds else append_body(landmarks, message.body, body)
         points = extract_message_keypoints(message)
         return Landmarks.empty() if points is None else self._select_landmarks(points.boxes, points.descriptor, seconds)
+
+    def _update_bodies(
+        self,
+        frame: AgentFrame,
+        messages: Sequence[Message],
+        landmarks: Sequence[Landmarks],
+        estimates: Sequence[PoseEstimate],
+        bodies: Mapping[int, BodyEstimate | None],
+    ) -> dict[int, BodyEstimate | None]:
+        """Return the estimated bodies of the ego and of senders that state none. landmarks: of the ego, then of the senders."""
+        updated = dict(bodies)
+        if self.net is not None:
+            return updated
+        own = landmarks[0] if frame.is_infrastructure else landmarks[0][:-1]
+        for message, theirs, estimate in zip(messages, landmarks[1:], estimates):
+            if message.timestamp_ns != frame.timestamp_ns or not estimate.status.has_estimate:
+                continue
+            time_s, pairs = frame.timestamp_ns * 1e-9, estimate.pairs
+            theirs = theirs if message.is_infrastructure else theirs[:-1]
+            if message.body is None and not message.is_infrastructure:
+                agent = message.agent_id
+                updated[agent] = update_body(updated.get(agent), own, theirs, pairs, time_s)
+            if frame.body is None and not frame.is_infrastructure:
+                agent = frame.agent_id
+                updated[agent] = update_body(updated.get(agent), theirs, own, pairs[:, ::-1], time_s)
+        return updated
 
     def _select_landmarks(self, boxes: Boxes, descriptor: Tensor | None, seconds: float) -> Landmarks:
         """Return boxes above min_score, propagated by their age."""

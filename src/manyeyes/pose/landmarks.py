@@ -137,12 +137,13 @@ class Landmarks:
         zero = np.zeros(0)
         return cls(np.zeros((0, 2)), zero, np.zeros((0, 2)), zero, zero, zero, zero, np.zeros(0, np.int64))
 
-    def with_body(self, body: AgentBody | None) -> Landmarks:
+    def with_body(self, body: AgentBody | None, error: DetectorUncertainty | None = None) -> Landmarks:
         """Append the vehicle that carries the sensor: other agents observe it, its own sensor does not.
 
-        body: in the frame of the landmarks; None: unknown, a car near the origin with a large uncertainty.
+        body: in the frame of the landmarks; None: unknown, a car near the origin with a large uncertainty. error: of body, that of
+        a stated one by default.
         """
-        error = UNKNOWN_BODY_UNCERTAINTY if body is None else KNOWN_BODY_UNCERTAINTY
+        error = error or (UNKNOWN_BODY_UNCERTAINTY if body is None else KNOWN_BODY_UNCERTAINTY)
         xy, yaw_rad, size = (0.0, 0.0), 0.0, UNKNOWN_BODY_SIZE_M
         if body is not None:
             xy, yaw_rad, size = body.center[:2], body.yaw_rad, body.size[:2]
