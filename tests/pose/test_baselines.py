@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes import Transform
-from manyeyes.pose.baselines import clipper, coalign, feaco, fpv_rcnn, icp, identity, mash, max_clique, v2x_reg, vips
+from manyeyes.pose.baselines import coalign, feaco, fpv_rcnn, icp, identity, mash, v2x_reg, vips
 from manyeyes.pose.baselines.v2x_reg import V2xRegConfig
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.types import PosePrior, PoseStatus, pose_difference
@@ -29,8 +29,6 @@ NEEDS_NONE = {
     "oIoU": partial(v2x_reg.correct, config=V2xRegConfig("oIoU")),
     "vips": vips.correct,
     "mash": mash.correct,
-    "clipper": clipper.correct,
-    "max-clique": max_clique.correct,
 }
 
 

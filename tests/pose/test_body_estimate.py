@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from manyeyes.datatypes import AgentBody, ConfigError
 from manyeyes.pose.body_estimate import BodyConfig, BodyEstimate, append_body, update_body
@@ -19,7 +20,7 @@ CARS = np.array([(12.0, 9.0, 0.3), (-15.0, 4.0, 1.2), (6.0, -18.0, -0.4), (30.0,
 PAIRS = np.stack((np.arange(4), np.arange(4)), 1)
 
 
-def landmarks(rows):
+def landmarks(rows: NDArray[np.float64]) -> Landmarks:
     """Cars at rows (N, 3) of x, y, yaw, with an error of 0.2 m."""
     ones = np.ones(len(rows))
     size = np.tile([4.2, 1.8], (len(rows), 1))
@@ -28,7 +29,7 @@ def landmarks(rows):
     )
 
 
-def from_observer(rows):
+def from_observer(rows: NDArray[np.float64]) -> Landmarks:
     x, y, yaw = SUBJECT_FROM_OBSERVER
     c, s = math.cos(yaw), math.sin(yaw)
     back = np.array([-c * x - s * y, s * x - c * y, -yaw])
@@ -78,7 +79,7 @@ def test_the_assumed_place_of_the_body_does_not_confirm_itself() -> None:
         (from_observer(np.concatenate((CARS, [(1.5, 0.0, 1.57)]))), PAIRS),  # a car across
     ],
 )
-def test_without_a_box_at_the_vehicle_nothing_is_estimated(observer, pairs) -> None:
+def test_without_a_box_at_the_vehicle_nothing_is_estimated(observer: Landmarks, pairs: NDArray[np.int64]) -> None:
     assert update_body(None, observer, SUBJECT, pairs, 0.0) is None
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from manyeyes.datatypes import ConfigError
 from manyeyes.pose.drift_test import CORRELATIONS, DriftTest, find_drift
 from manyeyes.pose.pose_monitor import PoseMonitorConfig
 
@@ -96,3 +97,9 @@ def test_the_limit_of_a_drift_is_lower_for_strongly_correlated_errors() -> None:
     sigmas, correlation = np.array([5.0, 5.0, 5.3, 4.8]), np.array([0.7, 0.8, 0.0, 0.95])
     found = DriftTest(sigmas, np.zeros((4, 3)), correlation)
     assert PoseMonitorConfig().is_drift(found).tolist() == [False, True, True, False]
+
+
+@pytest.mark.parametrize("gate", [0.0, -1.0])
+def test_the_limit_of_correlated_errors_is_above_zero(gate: float) -> None:
+    with pytest.raises(ConfigError, match="gates above 0"):
+        PoseMonitorConfig(correlated_drift_gate_sigmas=gate)

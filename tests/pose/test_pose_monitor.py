@@ -116,7 +116,7 @@ def test_memory_is_bounded_and_time_must_grow():
         update_monitor(state, measured(np.zeros(3)), PRIOR, 49.0)
 
 
-@pytest.mark.parametrize("field", ["offset_gate", "suspect_gate", "drift_gate_sigmas", "correlated_drift_gate_sigmas"])
+@pytest.mark.parametrize("field", ["offset_gate", "suspect_gate", "drift_gate_sigmas"])
 def test_gates_are_above_zero(field):
     assert getattr(PoseMonitorConfig(**{field: 1e-9}), field) == 1e-9
     for value in (0.0, -1.0):
