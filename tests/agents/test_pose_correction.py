@@ -36,7 +36,7 @@ def cars(count: int, seed: int) -> Boxes:
     rng = np.random.default_rng(seed)
     center = np.column_stack((100 + rng.uniform(-25, 25, count), 50 + rng.uniform(-25, 25, count), np.full(count, 0.8)))
     size = np.column_stack((rng.uniform(4, 5.2, count), rng.uniform(1.7, 2.1, count), np.full(count, 1.6)))
-    found = Boxes.of(*map(torch.from_numpy, (center, size)), torch.from_numpy(rng.uniform(-3, 3, count)))
+    found = Boxes.of(torch.from_numpy(center), torch.from_numpy(size), torch.from_numpy(rng.uniform(-3, 3, count)))
     sure = torch.full((count,), 0.1, dtype=torch.float64)
     return replace(found, sigma_xy=sure, sigma_yaw=sure * 0.2, p_flip=sure * 0.1)
 
@@ -137,7 +137,8 @@ def test_earlier_objects_are_propagated_to_the_current_time() -> None:
     now = frame(300_000_000)
     found = PoseCorrection().correct(now, cache_of(then.after(0.3)), [message], {})
     assert pose_error(found.messages[0], OTHERS[1])[0] < 0.1
-    still = replace(message, objects=replace(message.objects, velocity=torch.zeros(12, 2, dtype=torch.float64)))
+    stopped = replace(then.transform(OTHERS[1].inverse()), velocity=torch.zeros(12, 2, dtype=torch.float64))
+    still = replace(message, objects=stopped)
     assert (
         pose_error(PoseCorrection().correct(now, cache_of(then.after(0.3)), [still], {}).messages[0], OTHERS[1])[0]
         > 0.3

@@ -2,6 +2,7 @@
 """CLIPPER and the maximum clique on graphs small enough to work by hand."""
 
 import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -77,7 +78,7 @@ def test_the_search_ends_after_its_branches() -> None:
     assert len(max_clique.find_max_clique(everyone, 4)) < 12
 
 
-def boxes(places: list[tuple[float, float]], yaw: list[float]) -> Landmarks:
+def boxes(places: Sequence[tuple[float, float]], yaw: Sequence[float]) -> Landmarks:
     n = len(places)
     ones = np.ones(n)
     size = np.tile([4.5, 1.9], (n, 1))

@@ -36,7 +36,7 @@ class DriftTest:
     correlation: Floats
 
 
-def find_drift(residuals: Floats, time_s: Floats, stated_variance: Floats, min_frames: int) -> DriftTest:
+def find_drift(residuals: Floats, time_s: NDArray[np.floating], stated_variance: Floats, min_frames: int) -> DriftTest:
     """Return the most likely drift of sequences of residuals.
 
     Args:
