@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.message_header import age_s, ego_from_sender
+from manyeyes.agents.trust._claim_kernels import place_claims
 from manyeyes.agents.trust.association import Floats
 from manyeyes.datatypes import AgentFrame, Boxes, Message
-from manyeyes.models.detector.box_head import RawBoxes, decode
+from manyeyes.models.detector._decode_kernels import DecodedBoxes
+from manyeyes.models.detector.box_head import decode_rows
 from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.detector.protocols import has_tokens
 
@@ -81,42 +83,57 @@ def extract_claims(frame: AgentFrame, cache: PerceptionCache, messages: Sequence
 def _extract(frame: AgentFrame, cache: PerceptionCache, message: Message) -> Claims:
     ego_from_other, seconds = ego_from_sender(frame, message), age_s(frame, message)
     rotation, origin = ego_from_other.rotation.numpy(), ego_from_other.translation.numpy()
-    boxes = _stated_boxes(cache, message)
-    scores = boxes.score.double().numpy()
-    rows = np.argsort(-scores, kind="stable")[:MAX_CLAIMS]
-    rows = rows[scores[rows] >= MIN_SCORE]
-    center, size, box_yaw, velocity, sigma_xy = (
-        column.double().numpy()[rows]
-        for column in (boxes.center, boxes.size, boxes.yaw, boxes.velocity, boxes.sigma_xy)
-    )
     x, y, yaw = np.diagonal((frame.pose_covariance + message.pose_covariance).double().numpy()).clip(0).tolist()
-    variance = (x + y) / 2 + yaw * (center[:, :2] ** 2).sum(1)
-    variance += sigma_xy**2 + (SIGMA_VELOCITY_MPS * seconds) ** 2
-    stated_xy = center[:, :2].copy()
-    center[:, :2] += velocity * seconds
-    turn = math.atan2(rotation[1, 0], rotation[0, 0])
-    columns = (center @ rotation.T + origin, size, (box_yaw + turn)[:, None])
-    claims = Claims(
+    variances = (x + y) / 2 + (SIGMA_VELOCITY_MPS * seconds) ** 2, yaw
+    stated = _stated_boxes(cache, message)
+    columns, velocity, score, sigma_m, stated_xy = place_claims(
+        stated.center,
+        stated.size,
+        stated.yaw,
+        stated.velocity,
+        stated.score,
+        stated.sigma_xy,
+        rotation,
+        origin,
+        np.array([seconds, *variances, MIN_SCORE]),
+        MAX_CLAIMS,
+    )
+    return Claims(
         message.agent_id,
-        np.concatenate(columns, 1),
-        velocity @ rotation[:2, :2].T,
-        scores[rows],
-        np.sqrt(variance),
+        columns,
+        velocity,
+        score,
+        sigma_m,
         (float(origin[0]), float(origin[1])),
         seconds,
         message.objects is not None and message.tokens is None,
         stated_xy,
     )
-    is_finite = np.isfinite(claims.columns).all(1) & np.isfinite(claims.sigma_m)
-    return claims if is_finite.all() else claims[is_finite]
 
 
-def _stated_boxes(cache: PerceptionCache, message: Message) -> Boxes:
-    """Return the boxes that a message sends, or that its tokens propose, in its sender's frame."""
-    if message.objects is not None:
-        return message.objects
+class _StatedBoxes(NamedTuple):
+    """Boxes in their sender's frame: (N, 3), (N, 3), (N,), (N, 2), (N,), (N,)."""
+
+    center: Floats
+    size: Floats
+    yaw: Floats
+    velocity: Floats
+    score: Floats
+    sigma_xy: Floats
+
+    @classmethod
+    def of(cls, boxes: Boxes | DecodedBoxes) -> _StatedBoxes:
+        """Return the columns of boxes in float64."""
+        columns = (boxes.center, boxes.size, boxes.yaw, boxes.velocity, boxes.score, boxes.sigma_xy)
+        return cls(*(np.ascontiguousarray(column, np.float64) for column in columns))
+
+
+def _stated_boxes(cache: PerceptionCache, message: Message) -> _StatedBoxes:
+    """Return the boxes that a message sends, or that its tokens propose."""
     tokens, detector = message.tokens, cache.detector
+    if message.objects is not None:
+        return _StatedBoxes.of(message.objects)
     if tokens is None or not has_tokens(detector) or tokens.features.shape[1] < PROPOSAL_DIM:
-        return Boxes.empty()
-    raw = RawBoxes.of(tokens.features[:, -PROPOSAL_DIM:].float(), tokens.sites)
-    return decode(raw, replace(detector.decode_config, score_threshold=MIN_SCORE))[0]
+        return _StatedBoxes.of(Boxes.empty())
+    config = replace(detector.decode_config, score_threshold=MIN_SCORE)
+    return _StatedBoxes.of(decode_rows(tokens.features[:, -PROPOSAL_DIM:], tokens.sites, config))

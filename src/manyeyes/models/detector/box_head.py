@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from manyeyes.datatypes import LABELS, VEHICLE_LABELS, VEHICLES, Boxes, ConfigError, Sites, SparseBev
-from manyeyes.models.detector._decode_kernels import DecodeLimits, RawColumns, decode_grid
+from manyeyes.models.detector._decode_kernels import DecodedBoxes, DecodeLimits, RawColumns, decode_grid
 from manyeyes.models.detector.layers import SubmanifoldLayer
 from manyeyes.ops.nms import MAX_CANDIDATES, rotated_nms
 
@@ -245,6 +245,19 @@ def decode(raw: RawBoxes, config: DecodeConfig) -> list[Boxes]:
     return [boxes[rows] for boxes, rows in zip(together, order)]
 
 
+def decode_rows(rows: Tensor, sites: Sites, config: DecodeConfig) -> DecodedBoxes:
+    """Decode rows (N, BOX_LAYOUT.total) of one grid, on the CPU, as :func:`decode` does those of a head of one class, to arrays."""
+    columns = (rows, sites.xy, rows[:, BOX_LAYOUT.heatmap_logit][:, 0])
+    values, xy, heat = (column.detach().float().contiguous().numpy() for column in columns)
+    return decode_grid(values, xy, heat, float(sites.grid.cell_size_m), _RAW_COLUMNS, _make_limits(config))
+
+
+def _make_limits(config: DecodeConfig) -> DecodeLimits:
+    return DecodeLimits(
+        config.score_threshold, config.nms_iou, config.max_boxes, config.iou_score_weight, MAX_CANDIDATES
+    )
+
+
 def _relabel(boxes: Boxes, name: str) -> Boxes:
     """Return boxes of a class with its label; those of vehicles have labels of their own."""
     return boxes if name in VEHICLES else replace(boxes, label=torch.full_like(boxes.label, LABELS.index(name)))
@@ -254,9 +267,7 @@ def _decode_class(raw: RawBoxes, heatmap_logit: Tensor, config: DecodeConfig) ->
     """Decode the boxes of every grid by a heat map (N,)."""
     if heatmap_logit.device.type != "cpu" or heatmap_logit.dtype != torch.float32:
         return _decode_by_tensors(raw, heatmap_logit, config)
-    limits = DecodeLimits(
-        config.score_threshold, config.nms_iou, config.max_boxes, config.iou_score_weight, MAX_CANDIDATES
-    )
+    limits = _make_limits(config)
     columns = (raw.to_rows(), raw.sites.xy, heatmap_logit)
     rows, xy, heat = (column.detach().float().contiguous().numpy() for column in columns)
     batch, found = raw.sites.batch.numpy(), []
