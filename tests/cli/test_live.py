@@ -65,6 +65,37 @@ def test_a_team_runs_ends_and_is_computed_again(drive, weights, tmp_path, capfd,
     assert "leave --what-if out" in capfd.readouterr().err
 
 
+SOURCE = """
+from dataclasses import replace
+from pathlib import Path
+
+from manyeyes.datasets.registry import open_recording
+from manyeyes.runtime.sources import play_recording
+
+
+def frames(agent_id, now_ns):
+    recording = open_recording(Path("{drive}"), "test")
+    (first, *_) = play_recording(recording, recording.scenarios[0], -1, 0)
+    while True:
+        yield replace(first, agent_id=agent_id, timestamp_ns=now_ns() + 50_000_000)
+"""
+
+
+@pytest.mark.slow
+def test_frames_of_a_function_are_run_live(drive, weights, tmp_path, monkeypatch, capsys) -> None:
+    (tmp_path / "own_source.py").write_text(SOURCE.format(drive=drive))
+    monkeypatch.chdir(tmp_path)
+    words = ("--agent", 12, "--weights", weights, "--transport", "udp", "--rate", 0.2, "--out", tmp_path / "run.json")
+    assert run("live", "run", "--source", "own_source:frames", *words, "--frames", 3) == 0
+    summary = json.loads((tmp_path / "run.json").read_text())
+    assert summary["agent_id"] == 12 and summary["frames"] >= 1
+    assert run("live", "run", *words) == 1
+    assert run("live", "run", drive, "--source", "own_source:frames", *words) == 1
+    errors = capsys.readouterr().err.splitlines()
+    assert all("Give a recording, or --source module:function, and not both." in error for error in errors)
+    assert len(errors) == 2
+
+
 @pytest.mark.slow
 def test_one_agent_runs_alone_without_keys_and_writes_its_summary(drive, weights, tmp_path, capsys) -> None:
     out = tmp_path / "run.json"

@@ -3,16 +3,17 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from dataclasses import replace
 
 import pytest
 
-from manyeyes.datatypes import RecordingError, Snapshot
+from manyeyes.datatypes import ConfigError, RecordingError, Snapshot
 from manyeyes.runtime.clock import LiveClock, read_tai_ns
 from manyeyes.runtime.overload import MAX_LEVEL, TIMELY_DOWN, OverloadLadder
-from manyeyes.runtime.sources import NewestFrame, play_recording
+from manyeyes.runtime.sources import DeferredClock, NewestFrame, load_source, play_recording
 
 START_NS = 1_800_000_000 * 10**9
 
@@ -102,3 +103,28 @@ def test_the_ladder_rises_after_three_misses_of_ten_and_falls_after_thirty_timel
     assert [ladder.update(False) for _ in range(TIMELY_DOWN)][-2:] == [4, 3]
     rare = OverloadLadder()
     assert [rare.update(k % 5 == 0) for k in range(40)] == [0] * 40
+
+
+def test_a_source_is_a_function_by_name_that_is_found_in_the_working_directory(tmp_path, monkeypatch) -> None:
+    (tmp_path / "my_sensor_source.py").write_text("def frames(agent_id, now_ns):\n    yield agent_id, now_ns()\n")
+    monkeypatch.chdir(tmp_path)
+    deferred = DeferredClock(lambda: 5)
+    opened = iter(load_source("my_sensor_source:frames")(3, deferred))
+    deferred.now_ns = lambda: 7
+    assert next(opened) == (3, 7)  # pyright: ignore[reportComparisonOverlap]
+    assert "" not in sys.path[:1]
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("nothing", "module:function; got 'nothing'"),
+        (":frames", "module:function; got ':frames'"),
+        ("no_such_module_here:frames", "module no_such_module_here cannot be imported"),
+        ("math:no_such_function", "module math has no function no_such_function"),
+        ("math:pi", "module math has no function pi"),
+    ],
+)
+def test_a_source_that_is_not_there_is_refused(name: str, text: str) -> None:
+    with pytest.raises(ConfigError, match=text):
+        load_source(name)

@@ -3,16 +3,54 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 from manyeyes.datasets.base import Recording
 from manyeyes.datasets.frame_reader import as_frame_reader
-from manyeyes.datatypes import AgentFrame, RecordingError
+from manyeyes.datatypes import AgentFrame, ConfigError, RecordingError
 from manyeyes.runtime.clock import Clock
 
 _STEP_NS = 20_000_000
+
+FrameSource = Callable[[int, Callable[[], int]], Iterable[AgentFrame]]
+"""Called with the agent's id and the clock of the run (TAI, ns): it yields frames with times of that clock."""
+
+
+def load_source(name: str) -> FrameSource:
+    """Return the function of a name "module:function"; modules of the working directory are found, too.
+
+    Raises:
+        ConfigError: there is no such module or function.
+    """
+    module_name, colon, function_name = name.partition(":")
+    if not (module_name and colon and function_name):
+        raise ConfigError(f"A source of frames is named module:function; got {name!r}.")
+    sys.path.insert(0, "")
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        raise ConfigError(f"Source {name}: module {module_name} cannot be imported: {error}.") from error
+    finally:
+        sys.path.remove("")
+    function = getattr(module, function_name, None)
+    if not callable(function):
+        raise ConfigError(f"Source {name}: module {module_name} has no function {function_name}.")
+    return function
+
+
+class DeferredClock:
+    """The time of a clock that is set later; until then, of another one. Calling it returns ns."""
+
+    def __init__(self, until: Callable[[], int]) -> None:
+        self.now_ns = until
+
+    def __call__(self) -> int:
+        """Return the time now."""
+        return self.now_ns()
 
 
 def play_recording(

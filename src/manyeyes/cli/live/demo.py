@@ -223,7 +223,8 @@ def _run_processes(
                 process.communicate(timeout=1.0 + options.frames * FRAME_S / rate * 3 + END_TIMEOUT_S)
             for process in processes[num_agents:]:
                 process.terminate()
-                text = process.communicate(timeout=END_TIMEOUT_S)[0].strip()
+                # Its fusion compiles at first use, which takes longer than the end of an agent.
+                text = process.communicate(timeout=START_TIMEOUT_S)[0].strip()
         return rate, text
     finally:
         _end(processes)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run one agent on a network, in real time: its frames are those of a recording, played as they were taken.
+"""Run one agent on a network, in real time: its frames are those of a recording, played as they were taken, or of a function.
 
 Ctrl-C or SIGTERM end the run after the current frame; files are finished.
 """
@@ -9,7 +9,9 @@ from __future__ import annotations
 import signal
 import sys
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,8 +32,11 @@ if TYPE_CHECKING:
 class Options:
     """Which agent of which drive."""
 
-    recording: tyro.conf.Positional[Path]
+    recording: tyro.conf.Positional[Path | None] = None
     """A data set, a folder of scenarios, or one scenario, in the layout of any reader."""
+    source: str | None = None
+    """In place of a recording, module:function of your own; called with the agent's id and the clock (a function that returns TAI,
+    ns since 1970), it yields AgentFrames whose timestamp_ns are of that clock."""
     agent: AgentId = 0
     """Id of the agent in the recording."""
     split: str | None = None
@@ -39,7 +44,7 @@ class Options:
     scenario: str | None = None
     """Which scenario; the first by default."""
     frames: PositiveInt | None = None
-    """At most so many instants of it."""
+    """At most so many instants."""
     rate: PlaybackRate = 1.0
     """Speed of the clock; below 1 everything is slow, deadlines too, for machines that several agents share."""
     perceive_after_ms: DurationMs = 70.0
@@ -73,23 +78,18 @@ def main(options: Options) -> None:
 
     from manyeyes.cli.live.options import make_agent
     from manyeyes.cli.live.table import print_summaries, save_summary
-    from manyeyes.datasets.registry import open_recording
     from manyeyes.models import pretrained
     from manyeyes.runtime.live import LiveConfig, LiveRun
     from manyeyes.runtime.recorder import Recorder
-    from manyeyes.runtime.sources import play_recording
-    from manyeyes.studies.replay_options import make_excerpt
 
     torch.set_num_threads(options.threads)
     security = options.security.load(options.agent)
-    recording = open_recording(options.recording, options.split)
-    scenario = make_excerpt(recording, options.scenario).scenario
+    first, start_frames = _open_frames(options)
     config = options.method.describe(pretrained.load(options.method.weights).fingerprint, security.mode)
     deadlines = LiveConfig(round(options.perceive_after_ms * 1e6), round(options.deadline_ms * 1e6))
     agent = make_agent(config)
-    first = next(play_recording(recording, scenario, options.agent, 0, 1))
     clock = _wait_for_start(options, config, first)
-    frames = play_recording(recording, scenario, options.agent, clock.start_ns, options.frames)
+    frames = start_frames(clock)
     network = options.network.open(options.agent, clock.now_ns)
     try:
         x, y, _ = first.world_from_agent.translation.tolist()
@@ -102,6 +102,44 @@ def main(options: Options) -> None:
     if options.out is not None:
         save_summary(options.out, summary)
     print_summaries((summary,), Console())
+
+
+def _open_frames(options: Options) -> tuple[AgentFrame, Callable[[LiveClock], Iterator[AgentFrame]]]:
+    """Return the first frame, and a function that starts the frames by a clock."""
+    from manyeyes.datatypes import ConfigError
+
+    if (options.recording is None) == (options.source is None):
+        raise ConfigError("Give a recording, or --source module:function, and not both.")
+    if options.source is not None:
+        return _open_source(options, options.source)
+    from manyeyes.datasets.registry import open_recording
+    from manyeyes.runtime.sources import play_recording
+    from manyeyes.studies.replay_options import make_excerpt
+
+    assert options.recording is not None
+    recording = open_recording(options.recording, options.split)
+    scenario = make_excerpt(recording, options.scenario).scenario
+    first = next(play_recording(recording, scenario, options.agent, 0, 1))
+    return first, lambda clock: play_recording(recording, scenario, options.agent, clock.start_ns, options.frames)
+
+
+def _open_source(options: Options, source: str) -> tuple[AgentFrame, Callable[[LiveClock], Iterator[AgentFrame]]]:
+    """Do the same with a function of the user's own, which is called once."""
+    from manyeyes.datatypes import AgentFrame, ConfigError
+    from manyeyes.runtime.clock import read_tai_ns
+    from manyeyes.runtime.sources import DeferredClock, load_source
+
+    deferred = DeferredClock(read_tai_ns)
+    frames = iter(load_source(source)(options.agent, deferred))
+    first = next(frames, None)
+    if not isinstance(first, AgentFrame):
+        raise ConfigError(f"Source {source} must yield AgentFrames; the first is {type(first).__name__}.")
+
+    def start(clock: LiveClock) -> Iterator[AgentFrame]:
+        deferred.now_ns = clock.now_ns
+        return islice(frames, options.frames)
+
+    return first, start
 
 
 def _wait_for_start(options: Options, config: RunConfig, first: AgentFrame) -> LiveClock:
