@@ -79,6 +79,7 @@ CASES = [
     ("map build d", "shapely", "map build needs the 'map' extra"),
     ("map simulate", "pyarrow", "map simulate needs the 'map' extra"),
     ("map import d", "pyarrow", "map import needs the 'map' extra"),
+    ("map import a.osm b.gpkg", "pyproj", "map import with sources *.gpkg, *.geojson needs the 'map' extra"),
     ("map fuse d", "pyarrow", "map fuse needs the 'map' extra"),
     ("map fuse d --method polymerge", "shapely", "map fuse with method polymerge, "),
     ("map fuse d --store s", "shapely", "map fuse with store needs the 'map' extra"),

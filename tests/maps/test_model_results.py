@@ -53,6 +53,7 @@ def test_maptr_in_the_lidars_axes_is_turned_forward(tmp_path, poses):
     elements = observation.elements
     assert reading.frame == FRAME and not reading.rejected
     assert elements.kind.tolist() == [DIVIDER, CROSSING]
+    assert reading.left_out == {"class 'centerline'": 1}
     np.testing.assert_allclose(elements.polyline(0), [[5, 3], [5, -3]])
     assert elements.counts.tolist() == [2, 4]
     np.testing.assert_allclose(elements.score, [0.9, 0.4])

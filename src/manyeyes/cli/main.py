@@ -38,7 +38,7 @@ COMMAND_GROUPS = {
     "map": {
         "build": "build one map of a recording, from sensor data by way of messages",
         "simulate": "simulate a fleet: observations and ground truth of a place from a seed",
-        "import": "convert result files of MapTR or StreamMapNet with their poses to observations",
+        "import": "convert maps (Argoverse 2, Lanelet2, GeoPackage), or results of MapTR and StreamMapNet, to observations",
         "fuse": "fuse a folder of observations to one map",
         "retract": "remove observations from a store, and publish the map without them",
         "evaluate": "evaluate a map against the ground truth",
@@ -70,7 +70,7 @@ COMMAND_GROUPS = {
 }
 MODULES = {
     "fit-codebook": "fit_codebook",
-    "map import": "map import_predictions",
+    "map import": "map import_sources",
     "report check-cells": "report check_cells",
 }
 """Modules of commands whose name differs from the command."""

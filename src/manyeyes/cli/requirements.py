@@ -13,7 +13,7 @@ from manyeyes.datatypes.errors import MissingExtraError
 
 EXTRAS = {
     "sim": ("libsumo", "sumo", "shapely", "pyarrow"),
-    "map": ("shapely", "pyarrow", "pyogrio"),
+    "map": ("shapely", "pyarrow", "pyogrio", "pyproj"),
     "view": ("matplotlib", "PIL"),
     "av2": ("pyarrow", "shapely"),
     "dask": ("dask", "distributed"),
@@ -100,7 +100,11 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
     "report check-cells": (),
     "map build": (_ARROW, _SHAPELY, _MATPLOTLIB),
     "map simulate": (_ARROW, _SHAPELY),
-    "map import": (_ARROW,),
+    "map import": (
+        _ARROW,
+        _SHAPELY.when("sources", "*.osm", "*log_map_archive_*.json"),
+        Requirement("map", ("pyogrio", "shapely", "pyproj")).when("sources", "*.gpkg", "*.geojson"),
+    ),
     "map fuse": (
         _ARROW,
         _SHAPELY.when("method", "polymerge", "global-map-builder", "heatmap-buffer"),

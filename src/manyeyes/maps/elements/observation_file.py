@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -71,11 +71,15 @@ class InvalidRow:
 
 @dataclass(frozen=True)
 class LoadedObservations:
-    """What a file or folder held: the frame of its poses, the observations in file and row order, and what was rejected."""
+    """What a file or folder held: the frame of its poses, the observations in file and row order, and what was rejected.
+
+    left_out: what is no element of a map here, such as a class of a model's results, and how often.
+    """
 
     frame: MapFrame
     observations: tuple[Observation, ...]
     rejected: tuple[RejectedRows, ...]
+    left_out: Mapping[str, int] = field(default_factory=dict)
 
 
 def write_observations(path: Path | str, observations: Sequence[Observation], frame: MapFrame) -> None:

@@ -36,7 +36,7 @@ class Argoverse2MapError(ManyeyesError):
 
 def read_argoverse2_map(source: Path | str) -> RoadNetwork:
     """Return the roads of one log: a ``log_map_archive_*.json``, its ``map`` folder or the log's folder."""
-    path = _map_file(Path(source))
+    path = find_map_file(Path(source))
     try:
         root = parse_json(read_file(path))
     except (OSError, ValueError) as error:
@@ -151,7 +151,7 @@ class _Argoverse2Reader:
         return tuple(RoadMark(np.pad(ring, ((0, 0), (0, 1))), "curb", "", 0.0) for ring in found)
 
 
-def _map_file(path: Path) -> Path:
+def find_map_file(path: Path) -> Path:
     """Return the one vector map at, or below, a path."""
     if path.is_file():
         return path
@@ -203,4 +203,4 @@ def _make_marks(line: Array, kind: str, lane: str, side: str) -> list[RoadMark]:
     return marks
 
 
-__all__ = ["Argoverse2MapError", "read_argoverse2_map", "read_argoverse2_poses"]
+__all__ = ["Argoverse2MapError", "find_map_file", "read_argoverse2_map", "read_argoverse2_poses"]

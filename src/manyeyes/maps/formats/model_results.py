@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import csv
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -109,7 +110,10 @@ RESULT_OPTIONS = {
 
 
 def read_model_results(source: Path | str, poses: PoseTable, options: ModelResultOptions) -> LoadedObservations:
-    """Return the samples of a result file of MapTR or StreamMapNet (distinguished by their layout) as observations, by token."""
+    """Return the samples of a result file of MapTR or StreamMapNet (distinguished by their layout) as observations, by token.
+
+    Vectors of classes that are no element here, such as MapTRv2's centerline, are counted by class in ``left_out``.
+    """
     path = Path(source)
     root = _json(path, _unique)
     results = root.get("results") if isinstance(root, dict) else None
@@ -119,6 +123,7 @@ def read_model_results(source: Path | str, poses: PoseTable, options: ModelResul
         )
     pose_of_token = dict(zip(poses.tokens, poses.poses))
     kept, rejected, read = [], [], set[str]()
+    left_out: Counter[str] = Counter()
     for row, (token, vectors) in enumerate(_samples(results)):
         context = f"{path}: sample '{shorten(token)}'"
         try:
@@ -128,9 +133,10 @@ def read_model_results(source: Path | str, poses: PoseTable, options: ModelResul
                 raise ModelResultsError(f"{context} is there twice; the first one counts. Leave one out.")
             read.add(token)
             kept.append(_observation(pose_of_token[token], vectors, options, context))
+            left_out.update(_class_name(v.name) for v in vectors or () if _kind(v.name) is None)
         except (ModelResultsError, ObservationError) as error:
             rejected.append(RejectedRows(str(path), row, 1, str(error)))
-    return LoadedObservations(poses.frame, tuple(kept), tuple(rejected))
+    return LoadedObservations(poses.frame, tuple(kept), tuple(rejected), dict(left_out))
 
 
 @dataclass(frozen=True)
@@ -203,6 +209,10 @@ def _kind(name: Any) -> int | None:
     if isinstance(name, int) and not isinstance(name, bool):
         return _KIND_OF_LABEL[name] if 0 <= name < len(_KIND_OF_LABEL) else None
     return _KIND_OF_NAME.get(str(name))
+
+
+def _class_name(name: Any) -> str:
+    return f"class {shorten(repr(name) if isinstance(name, str) else name)}"
 
 
 def _score(value: Any, context: str) -> float:
