@@ -20,9 +20,10 @@ if TYPE_CHECKING:
     from manyeyes.maps.elements.observation import MapFrame, Observation
     from manyeyes.maps.elements.observation_file import LoadedObservations, RejectedRows
     from manyeyes.maps.elements.vector_map import VectorMap
+    from manyeyes.maps.fusion.observed_ground import ObservedGround
 
 ROWS_PER_FILE = 5000
-LINES_FILE, CROSSINGS_FILE = "lines.parquet", "crossings.parquet"
+LINES_FILE, CROSSINGS_FILE, GROUND_FILE = "lines.parquet", "crossings.parquet", "ground.npz"
 
 
 @dataclass(frozen=True)
@@ -136,3 +137,37 @@ def read_vector_map(folder: Path) -> VectorMap:
             "Make the map again with 'manyeyes map fuse'."
         )
     return read_map(*files)
+
+
+def read_ground(folder: Path, vector_map: VectorMap) -> ObservedGround:
+    """Return what a map's observations saw: stored with it, of a store's log, or of the observations beside the map's folder.
+
+    Without any of them, the ground near the map's own elements, ``is_assumed``.
+    """
+    from manyeyes.maps.fusion.observed_ground import ObservedGround
+
+    if (folder / GROUND_FILE).is_file():
+        return ObservedGround.read(folder / GROUND_FILE)
+    if (folder / "store.json").is_file():
+        return _read_store_ground(folder)
+    beside = folder.resolve().parent / "observations"
+    if beside.is_dir() and any(beside.glob("*.parquet")):
+        from manyeyes.maps.elements.observation_file import read_observations
+
+        loaded = read_observations(beside)
+        return ObservedGround.of_observations(loaded.observations, loaded.frame)
+    return ObservedGround.around(vector_map.elements, vector_map.frame)
+
+
+def _read_store_ground(folder: Path) -> ObservedGround:
+    """Return what the observations of a store that count now saw."""
+    import numpy as np
+
+    from manyeyes.maps.fusion.observed_ground import ObservedGround
+    from manyeyes.maps.store.observation_log import read_active
+    from manyeyes.maps.store.store import MapStore
+
+    store = MapStore(folder)
+    active = store.log.active_observations()
+    observations = read_active(store.log.folder, active, np.arange(len(active.ids)))
+    return ObservedGround.of_observations(observations, store.frame)

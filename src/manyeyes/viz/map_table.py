@@ -36,13 +36,16 @@ def make_kinds_table(metrics: MapMetrics, title: str) -> RenderableType:
 
 def make_change_table(changes: Sequence[KindChange], title: str) -> RenderableType:
     """Tabulate changes: a row for each kind that has elements."""
+    counts = [(c.num_unchanged, c.num_changed, c.num_added, c.num_removed) for c in changes]
+    outside = [(c.num_outside_old, c.num_outside_new) for c in changes]
+    lengths = [(c.added_length_m, c.removed_length_m, c.outside_old_length_m, c.outside_new_length_m) for c in changes]
     lines = [
-        (c.kind, *map(str, counts), f"{c.added_length_m:.0f}", f"{c.removed_length_m:.0f}")
-        for c in changes
-        for counts in ((c.num_unchanged, c.num_changed, c.num_added, c.num_removed),)
-        if any(counts)
+        (c.kind, *map(str, counts[k]), *(f"{length:.0f}" for length in lengths[k]))
+        for k, c in enumerate(changes)
+        if any((*counts[k], *outside[k]))
     ]
-    return make_table(title, ("kind", "kept", "changed", "added", "removed", "added [m]", "removed [m]"), lines)
+    names = ("kind", "kept", "changed", "added", "removed", "added [m]", "removed [m]")
+    return make_table(title, (*names, "outside old [m]", "outside new [m]"), lines)
 
 
 def _format_number(value: float, digits: int = 3) -> str:

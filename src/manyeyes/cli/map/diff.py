@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""List what changed from one map to another: elements by id, length by location; optionally as a web page."""
+"""List what changed from one map to another where both were observed; optionally as a web page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from manyeyes._bounds import OutputFile
 
 @dataclass(frozen=True)
 class Options:
-    """Two maps of one frame."""
+    """Two maps, of one frame or of two."""
 
     old: tyro.conf.Positional[Path]
     """The earlier map's folder, of 'map fuse'."""
@@ -29,8 +29,10 @@ def main(options: Options) -> None:
 
     from manyeyes.datatypes import ConfigError
     from manyeyes.evaluation.maps.change_summary import compare_maps
+    from manyeyes.maps.formats.reframe import move_to_frame
+    from manyeyes.maps.fusion.observed_ground import ASSUMED_MARGIN_M
     from manyeyes.studies import provenance
-    from manyeyes.studies.map_folder import read_vector_map
+    from manyeyes.studies.map_folder import read_ground, read_vector_map
     from manyeyes.viz.map_page import make_change_page, save_map_page
     from manyeyes.viz.map_table import make_change_table
 
@@ -38,12 +40,21 @@ def main(options: Options) -> None:
         raise ConfigError(f"--out ends in .json or .html; got {options.out.name}.")
     console = Console()
     old, new = read_vector_map(options.old), read_vector_map(options.new)
-    change = compare_maps(old, new)
+    grounds = [read_ground(folder, m) for folder, m in ((options.old, old), (options.new, new))]
+    change = compare_maps(old, new, *grounds)
     console.print(make_change_table(change.kinds, f"From {options.old} to {options.new}"))
+    for folder, ground in zip((options.old, options.new), grounds):
+        if ground.is_assumed:
+            console.print(
+                f"{folder} has no observations: it is taken to cover the ground within {ASSUMED_MARGIN_M:g} m of its lines.",
+                highlight=False,
+                soft_wrap=True,
+            )
     if options.out is None:
         return
     if options.out.suffix.lower() == ".json":
         provenance.write_json(options.out, change, options, None)
     else:
-        save_map_page(make_change_page(f"{options.old.name} to {options.new.name}", old, new, change), options.out)
+        moved = move_to_frame(old, new.frame)
+        save_map_page(make_change_page(f"{options.old.name} to {options.new.name}", moved, new, change), options.out)
     console.print(f"{options.out} holds it", highlight=False, soft_wrap=True)

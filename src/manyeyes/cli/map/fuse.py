@@ -65,10 +65,11 @@ def _fuse_into_folder(
     """Fuse observations, without those that make the method fail, and write the map."""
     import time
 
+    from manyeyes.maps.fusion.observed_ground import ObservedGround
     from manyeyes.maps.isolation import reject_failed
     from manyeyes.maps.registry import fuse_isolated
     from manyeyes.studies import provenance
-    from manyeyes.studies.map_folder import report_rejected, write_vector_map
+    from manyeyes.studies.map_folder import GROUND_FILE, report_rejected, write_vector_map
 
     start = time.perf_counter()
     with console.status(f"Fusing {len(loaded.observations)} observations"):
@@ -78,7 +79,10 @@ def _fuse_into_folder(
     report_rejected(failed, console)
     rejected = (*loaded.rejected, *failed)
     num_fused = len(loaded.observations) - len(failed)
+    failed_rows = {one.row for one in failures}
+    counted = [o for row, o in enumerate(loaded.observations) if row not in failed_rows]
     write_vector_map(fused, out)
+    ObservedGround.of_observations(counted, loaded.frame).write(out / GROUND_FILE)
     published = len(fused.select_published())
     payload = {
         "observations": num_fused,

@@ -27,7 +27,7 @@ def find_observed_cells(
 
     Returns runs (R, 3): row, first column and last column of cells, ascending; no two runs touch.
     """
-    runs = _fill_rings(arrays.view_corners_in_world(pose), arrays.view.ring_offsets)
+    runs = fill_rings(arrays.view_corners_in_world(pose), arrays.view.ring_offsets)
     if area is not None:
         x0, y0, x1, y1 = np.floor(np.array(area) / CELL_M + 0.5).astype(np.int64)
         runs = runs[(runs[:, 0] >= y0) & (runs[:, 0] < y1) & (runs[:, 1] < x1) & (runs[:, 2] >= x0)]
@@ -62,7 +62,7 @@ def cut_unobserved(points: Floats, offsets: Ints, inferred: NDArray[np.bool_], r
 
 
 @njit(cache=True, nogil=True)
-def _fill_rings(corners: F64x2, first: I64x1) -> I64x2:  # pragma: no cover - compiled
+def fill_rings(corners: F64x2, first: I64x1) -> I64x2:  # pragma: no cover - compiled
     """Runs of cells whose middle lies in a ring, by the even-odd rule, ring by ring."""
     rows, n = np.empty((1024, 3), np.int64), 0
     for r in range(len(first) - 1):
