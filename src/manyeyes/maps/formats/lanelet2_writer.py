@@ -1,9 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Published elements as a Lanelet2 map in OSM XML, which the ``lanelet2`` package reads back.
+"""Published elements as a Lanelet2 map in OSM XML, which the ``lanelet2`` package reads back and routes on.
 
-Dividers, boundaries and stop lines become tagged line strings; two lines that bound a lane (:mod:`manyeyes.maps.formats.lanes`)
-become a lanelet, in no direction of travel, as lines do not tell it; a crossing becomes a lanelet of subtype ``crosswalk``
-between its two long sides. Source: Lanelet2 documentation, "Linestring Tagging" and "Lanelet and Area Tagging".
+Dividers, boundaries and stop lines become tagged line strings. Lines that bound a lane are cut into pieces that lanelets share
+(:mod:`manyeyes.maps.formats.lane_sections`): a lanelet's neighbour has a side in common with it, its successor two points.
+Connections over junctions and gaps are lanelets between virtual lines (:mod:`manyeyes.maps.formats.lane_connections`). A lanelet
+of unknown direction has ``one_way=no``. A crossing becomes a lanelet of subtype ``crosswalk`` between its two long sides.
+
+A stop line is a regulatory element ``traffic_sign`` of the lanelets that end at it, itself the sign and the line to stop at. A
+crossing is one of subtype ``right_of_way``: its lanelet has it, the lanelets that cross it yield, at their stop line if they have
+one. Source: Lanelet2 documentation, "Linestring Tagging", "Lanelet and Area Tagging", "Regulatory Element Tagging".
 """
 
 from __future__ import annotations
@@ -18,7 +23,8 @@ from manyeyes._io import atomic_write
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, DOUBLE, SOLID, STOP_LINE, STYLES
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.formats.attributes import Attributes
-from manyeyes.maps.formats.lanes import find_lane_pairs
+from manyeyes.maps.formats.lane_connections import connect_lanes
+from manyeyes.maps.formats.lane_sections import build_lane_sections
 from manyeyes.maps.formats.rings import split_long_sides
 from manyeyes.maps.roads.transverse_mercator import degrees_from_metres
 
@@ -26,13 +32,8 @@ Tags = tuple[tuple[str, str], ...]
 
 _TYPE = {DIVIDER: "line_thin", BOUNDARY: "road_border", STOP_LINE: "stop_line"}
 _SUBTYPE = {SOLID: "solid", DASHED: "dashed", DOUBLE: "solid_solid"}
-_ROAD: Tags = (
-    ("type", "lanelet"),
-    ("subtype", "road"),
-    ("location", "urban"),
-    ("one_way", "no"),
-    ("participant:vehicle", "yes"),
-)
+_ROAD: Tags = (("type", "lanelet"), ("subtype", "road"), ("location", "urban"), ("participant:vehicle", "yes"))
+_VIRTUAL: Tags = (("type", "virtual"),)
 _CROSSWALK: Tags = (
     ("type", "lanelet"),
     ("subtype", "crosswalk"),
@@ -42,19 +43,57 @@ _CROSSWALK: Tags = (
 )
 
 
-def write_lanelet2(vector_map: VectorMap, path: Path | str) -> None:
-    """Write the published elements as an OSM file; ``local_x`` and ``local_y`` of a node are metres in the map's frame."""
+def write_lanelet2(vector_map: VectorMap, path: Path | str, drives_on_right: bool = True) -> None:
+    """Write the published elements as an OSM file; ``local_x`` and ``local_y`` of a node are metres in the map's frame.
+
+    drives_on_right: the side of a double line on which traffic keeps, where no stop line tells the direction.
+    """
     m = vector_map.select_published()
     writer = _Writer(m)
-    e = m.elements
-    way_of = {row: writer.way(e.polyline(row), _line_tags(m, row)) for row in np.flatnonzero(~e.closed).tolist()}
-    for pair in find_lane_pairs(m):
-        writer.lanelet(way_of[pair.left], way_of[pair.right], _ROAD)
-    for row in np.flatnonzero(e.kind == CROSSING).tolist():
+    graph = build_lane_sections(m)
+    stops = connect_lanes(graph, m, drives_on_right)
+    tags = {row: _line_tags(m, row) for row in np.flatnonzero(~m.elements.closed).tolist()}
+    ways = [writer.way(p.points, tags.get(p.row, _VIRTUAL), (p.first, p.last)) for p in graph.pieces]
+    way_of = {piece.row: way for piece, way in zip(graph.pieces, ways)}
+    rules: list[list[int]] = [[] for _ in graph.sections]
+    for row in sorted({row for row, _ in stops}):
+        rule = writer.rule("traffic_sign", [("way", way_of[row], "refers"), ("way", way_of[row], "ref_line")])
+        for number in sorted({section for stop, section in stops if stop == row}):
+            rules[number].append(rule)
+    lanelets = [writer.reserve() for _ in graph.sections]
+    stop_of = {section: way_of[row] for row, section in stops}
+    for row in np.flatnonzero(m.elements.kind == CROSSING).tolist():
+        ring = m.elements.polyline(row)
         marking: Tags = (("type", "pedestrian_marking"), ("manyeyes:id", writer.ids[row]))
-        left, right = (writer.way(side, marking) for side in split_long_sides(e.polyline(row)))
-        writer.lanelet(left, right, _CROSSWALK)
+        sides = tuple(writer.way(side, marking) for side in split_long_sides(ring))
+        crosswalk = writer.reserve()
+        over = [k for k, section in enumerate(graph.sections) if _crosses(graph.middle_line(section, 60), ring)]
+        own_rules = []
+        if over:
+            members = [("relation", crosswalk, "right_of_way"), *(("relation", lanelets[k], "yield") for k in over)]
+            before = sorted({stop_of[k] for k in over if k in stop_of})
+            own_rules = [writer.rule("right_of_way", members + [("way", way, "ref_line") for way in before[:1]])]
+            for k in over:
+                rules[k] += own_rules
+        writer.lanelet(crosswalk, sides, _CROSSWALK, own_rules)
+    for number, section, own_rules in zip(lanelets, graph.sections, rules):
+        sides = (ways[section.left], ways[section.right])
+        one_way: Tags = (("one_way", "yes" if section.direction else "no"),)
+        writer.lanelet(number, sides[::-1] if section.direction < 0 else sides, _ROAD + one_way, own_rules)
     atomic_write(Path(path), writer.text().encode())
+
+
+def _crosses(line: NDArray[np.float64], ring: NDArray[np.float64]) -> bool:
+    """Return whether a point of a line (M, 2) lies inside an open ring (K, 2), by the even-odd rule."""
+    low, high = ring.min(0), ring.max(0)
+    inside = False
+    for x, y in line[((line >= low) & (line <= high)).all(1)]:
+        a, b = ring, np.roll(ring, -1, axis=0)
+        beside = (a[:, 1] > y) != (b[:, 1] > y)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            at = a[:, 0] + (y - a[:, 1]) * (b[:, 0] - a[:, 0]) / (b[:, 1] - a[:, 1])
+        inside |= bool((beside & (at > x)).sum() % 2)
+    return inside
 
 
 def _line_tags(m: VectorMap, row: int) -> Tags:
@@ -64,6 +103,9 @@ def _line_tags(m: VectorMap, row: int) -> Tags:
     # A divider without a known style is exported without paint type: virtual lines are not painted.
     if kind == DIVIDER:
         tags = [("type", "virtual")] if STYLES[style] == "none" else [*tags, ("subtype", _SUBTYPE[style])]
+    if kind == STOP_LINE:
+        # The regulatory element refers to the line as its sign, whose subtype is the sign's name.
+        tags.append(("subtype", "stop_line"))
     tags.append(("manyeyes:id", m.id[row].tobytes().hex()))
     return tuple(tags)
 
@@ -76,31 +118,47 @@ class _Writer:
         self.ids = Attributes.of(m).id.tolist()
         self.count = 0
         self.nodes: list[str] = []
+        self.node_of_key: dict[tuple[int, int], int] = {}
         self.ways: list[str] = []
         self.relations: list[str] = []
 
-    def way(self, line: NDArray[np.float64], tags: Tags) -> int:
-        """Add a line string with its own nodes; its id."""
+    def way(
+        self, line: NDArray[np.float64], tags: Tags, ends: tuple[tuple[int, int], tuple[int, int]] | None = None
+    ) -> int:
+        """Add a line string; its first and last node are shared with those of equal keys. Returns its id."""
         references = []
         degrees = degrees_from_metres(line, self.origin).tolist()
-        for (latitude, longitude), (x, y) in zip(degrees, line.tolist()):
-            node = self._next()
+        keys = [None] * len(line) if ends is None else [ends[0], *[None] * (len(line) - 2), ends[1]]
+        for (latitude, longitude), (x, y), key in zip(degrees, line.tolist(), keys):
+            node = self.node_of_key.get(key) if key is not None else None
+            if node is None:
+                node = self.reserve()
+                local = _tags((("local_x", f"{x:.4f}"), ("local_y", f"{y:.4f}"), ("ele", "0")))
+                degree = f'lat="{latitude:.10f}" lon="{longitude:.10f}"'
+                self.nodes.append(f'  <node id="{node}" visible="true" version="1" {degree}>\n{local}  </node>\n')
+                if key is not None:
+                    self.node_of_key[key] = node
             references.append(f'    <nd ref="{node}"/>\n')
-            local = _tags((("local_x", f"{x:.4f}"), ("local_y", f"{y:.4f}"), ("ele", "0")))
-            self.nodes.append(
-                f'  <node id="{node}" visible="true" version="1" lat="{latitude:.10f}" lon="{longitude:.10f}">\n{local}  </node>\n'
-            )
-        way = self._next()
+        way = self.reserve()
         self.ways.append(f'  <way id="{way}" visible="true" version="1">\n{"".join(references)}{_tags(tags)}  </way>\n')
         return way
 
-    def lanelet(self, left: int, right: int, tags: Tags) -> None:
-        """Add a lanelet between two ways."""
-        members = "".join(
-            f'    <member type="way" ref="{way}" role="{role}"/>\n' for way, role in ((left, "left"), (right, "right"))
-        )
+    def lanelet(self, number: int, sides: tuple[int, ...], tags: Tags, rules: list[int]) -> None:
+        """Add a lanelet between two ways, left and right, with its regulatory elements."""
+        members = [("way", way, role) for way, role in zip(sides, ("left", "right"), strict=True)]
+        self._relation(number, members + [("relation", rule, "regulatory_element") for rule in rules], tags)
+
+    def rule(self, subtype: str, members: list[tuple[str, int, str]]) -> int:
+        """Add a regulatory element; its id."""
+        number = self.reserve()
+        tags = [("type", "regulatory_element"), ("subtype", subtype)]
+        self._relation(number, members, tuple(tags))
+        return number
+
+    def _relation(self, number: int, members: list[tuple[str, int, str]], tags: Tags) -> None:
+        text = "".join(f'    <member type="{kind}" ref="{ref}" role="{role}"/>\n' for kind, ref, role in members)
         self.relations.append(
-            f'  <relation id="{self._next()}" visible="true" version="1">\n{members}{_tags(tags)}  </relation>\n'
+            f'  <relation id="{number}" visible="true" version="1">\n{text}{_tags(tags)}  </relation>\n'
         )
 
     def text(self) -> str:
@@ -108,7 +166,8 @@ class _Writer:
         body = "".join((*self.nodes, *self.ways, *self.relations))
         return f'<?xml version="1.0" encoding="UTF-8"?>\n<osm version="0.6" generator="manyeyes">\n{body}</osm>\n'
 
-    def _next(self) -> int:
+    def reserve(self) -> int:
+        """Return an id that nothing has."""
         self.count += 1
         return self.count
 

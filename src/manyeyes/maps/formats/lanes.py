@@ -13,7 +13,7 @@ from manyeyes.maps.elements.vector_map import VectorMap
 
 Floats = NDArray[np.float64]
 
-_MIN_WIDTH_M, _MAX_WIDTH_M = 2.5, 4.5
+MIN_WIDTH_M, MAX_WIDTH_M = 2.5, 4.5
 _SPACING_M = 2.0
 # Of the shorter line, so much must lie beside the other.
 _MIN_OVERLAP = 0.8
@@ -31,13 +31,16 @@ class LanePair:
 def find_lane_pairs(vector_map: VectorMap) -> list[LanePair]:
     """Dividers and boundaries whose right neighbour runs 2.5 to 4.5 m beside at least 80 % of the shorter one's length.
 
-    Neighbours are those of the map's topology, so a line bounds at most one lane on each hand. Ascending by rows.
+    Neighbours are those of the map's topology, in either order: a line that goes on where several end bounds several lanes on
+    a hand. Ascending by rows.
     """
     e = vector_map.elements
     lines = np.isin(e.kind, (DIVIDER, BOUNDARY))
     taken: set[frozenset[int]] = set()
     out: list[LanePair] = []
-    for left, right in sorted(set(map(tuple, vector_map.topology.right.tolist()))):
+    candidates = {(left, right) for left, right in vector_map.topology.right.tolist()}
+    candidates |= {(left, right) for right, left in vector_map.topology.left.tolist()}
+    for left, right in sorted(candidates):
         both = frozenset((left, right))
         if both in taken or not (lines[left] and lines[right]):
             continue
@@ -54,7 +57,7 @@ def _is_lane(a: Floats, b: Floats) -> bool:
     shorter, other, side = (a, b, 1.0) if _length(a) <= _length(b) else (b, a, -1.0)
     offset = side * _offsets_to_left(_resample(shorter), other)
     beside = np.isfinite(offset)
-    inside = (offset[beside] >= _MIN_WIDTH_M) & (offset[beside] <= _MAX_WIDTH_M)
+    inside = (offset[beside] >= MIN_WIDTH_M) & (offset[beside] <= MAX_WIDTH_M)
     return bool(beside.mean() >= _MIN_OVERLAP and inside.mean() >= 0.9)
 
 
