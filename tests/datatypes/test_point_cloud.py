@@ -49,3 +49,21 @@ def test_a_point_that_is_not_finite_is_refused_and_a_large_sum_is_not(bad: float
     with pytest.raises(ShapeError, match="1 of 9 points"):
         PointCloud.of(points)
     assert len(PointCloud.of(torch.full((9, 3), 3e38))) == 9
+
+
+@pytest.mark.parametrize("kept", [0, 7, 50])
+def test_a_mask_selects_rows_of_strided_fields_and_of_fields_with_gradients(kept: int) -> None:
+    whole, mask = cloud(100), torch.arange(50) < kept
+    some = PointCloud(whole.xyz[::2], whole.intensity[::2], whole.time_s[::2])
+    assert torch.equal(some[mask].xyz, some.xyz[:kept]) and torch.equal(some[mask].time_s, some.time_s[:kept])
+    xyz = some.xyz.clone().requires_grad_()
+    PointCloud(xyz, some.intensity, some.time_s)[mask].xyz.sum().backward()
+    assert xyz.grad is not None and float(xyz.grad.sum()) == 3 * kept
+
+
+def test_a_scaled_cloud_has_the_products_of_tensors() -> None:
+    some, factors = cloud(500), (1.03, -1.03, 0.97)
+    assert torch.equal(some.scale(factors).xyz, some.xyz * torch.tensor(factors))
+    xyz = some.xyz.clone().requires_grad_()
+    PointCloud(xyz, some.intensity, some.time_s).scale(factors).xyz.sum().backward()
+    assert xyz.grad is not None and torch.allclose(xyz.grad[0], torch.tensor(factors))

@@ -47,10 +47,10 @@ class Boxes:
     def __post_init__(self) -> None:
         n = self.center.shape[0] if self.center.ndim else 0
         expected = {"center": (n, 3), "size": (n, 3), "velocity": (n, 2)}
-        for field in fields(self):
-            shape = tuple(getattr(self, field.name).shape)
-            if shape != expected.get(field.name, (n,)):
-                raise ShapeError(f"Boxes.{field.name} needs shape {expected.get(field.name, (n,))}; got {shape}.")
+        for name in _FIELDS:
+            shape = getattr(self, name).shape
+            if shape != expected.get(name, (n,)):
+                raise ShapeError(f"Boxes.{name} needs shape {expected.get(name, (n,))}; got {tuple(shape)}.")
 
     @classmethod
     def of(
@@ -104,16 +104,17 @@ class Boxes:
     def __getitem__(self, index: Tensor | slice) -> Boxes:
         if isinstance(index, Tensor) and index.dtype == torch.bool:
             index = index.nonzero()[:, 0]  # once instead of for each field
-        return Boxes(*(getattr(self, f.name)[index] for f in fields(self)))
+            return Boxes(*(getattr(self, name).index_select(0, index) for name in _FIELDS))
+        return Boxes(*(getattr(self, name)[index] for name in _FIELDS))
 
     @classmethod
     def cat(cls, many: list[Boxes]) -> Boxes:
         """Return several sets of one frame as one."""
-        return cls(*(torch.cat([getattr(b, f.name) for b in many]) for f in fields(cls))) if many else cls.empty()
+        return cls(*(torch.cat([getattr(b, name) for b in many]) for name in _FIELDS)) if many else cls.empty()
 
     def to(self, dtype: torch.dtype | None = None, device: torch.device | None = None) -> Boxes:
         """Return the same boxes in another floating-point type, or on another device, or both."""
-        values = [getattr(self, f.name) for f in fields(self)]
+        values = [getattr(self, name) for name in _FIELDS]
         if device is None and all(dtype is None or v.dtype == dtype or not v.is_floating_point() for v in values):
             return self
         return Boxes(*(v.to(device=device, dtype=dtype if v.is_floating_point() else None) for v in values))
@@ -123,7 +124,7 @@ class Boxes:
         turn = target_from_source.rotation.to(self.yaw.dtype).mT
         ahead = torch.stack((self.yaw.cos(), self.yaw.sin(), torch.zeros_like(self.yaw)), -1) @ turn
         velocity = (self.velocity.to(turn.dtype) @ turn[:2])[:, :2]
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        values = {name: getattr(self, name) for name in _FIELDS}
         values |= {"center": target_from_source.apply(self.center), "yaw": torch.atan2(ahead[:, 1], ahead[:, 0])}
         return Boxes(**(values | {"velocity": velocity}))
 
@@ -178,3 +179,6 @@ class Boxes:
 def wrap_angle(angle: Tensor) -> Tensor:
     """Wrap angles to [-pi, pi), radians."""
     return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+
+
+_FIELDS = tuple(field.name for field in fields(Boxes))

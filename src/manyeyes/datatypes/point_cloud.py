@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from manyeyes.datatypes._point_kernels import move_points
+from manyeyes.datatypes._point_kernels import keep_points, move_points, scale_points
 from manyeyes.datatypes.errors import ShapeError
 from manyeyes.datatypes.numbers import Numbers, as_tensor
 from manyeyes.datatypes.transform import Transform
@@ -66,6 +66,9 @@ class PointCloud:
 
     def __getitem__(self, index: Tensor | slice) -> PointCloud:
         if isinstance(index, Tensor) and index.dtype == torch.bool:
+            if index.shape == self.intensity.shape and all(map(_is_plain, (self.xyz, self.intensity, self.time_s))):
+                columns = (field.contiguous().numpy() for field in (self.xyz, self.intensity, self.time_s))
+                return PointCloud(*map(torch.from_numpy, keep_points(*columns, index.contiguous().numpy())))
             index = index.nonzero()[:, 0]  # once instead of for each field
             return PointCloud(*(field.index_select(0, index) for field in (self.xyz, self.intensity, self.time_s)))
         return PointCloud(self.xyz[index], self.intensity[index], self.time_s[index])
@@ -73,12 +76,20 @@ class PointCloud:
     def transform(self, target_from_source: Transform) -> PointCloud:
         """Return the same returns in another frame."""
         xyz, rotation = self.xyz, target_from_source.rotation
-        if rotation.dim() == 2 and xyz.device.type == "cpu" and xyz.dtype == torch.float32 and not xyz.requires_grad:
+        if rotation.dim() == 2 and _is_plain(xyz):
             turn, shift = rotation.float().contiguous(), target_from_source.translation.float()
             moved = torch.from_numpy(move_points(xyz.contiguous().numpy(), turn.numpy(), shift.numpy()))
         else:
             moved = target_from_source.apply(xyz)
         return PointCloud(moved, self.intensity, self.time_s)
+
+    def scale(self, factors: tuple[float, float, float]) -> PointCloud:
+        """Return the same returns with x, y and z multiplied by factors."""
+        if _is_plain(self.xyz):
+            scaled = torch.from_numpy(scale_points(self.xyz.contiguous().numpy(), *factors))
+        else:
+            scaled = self.xyz * self.xyz.new_tensor(factors)
+        return PointCloud(scaled, self.intensity, self.time_s)
 
     @classmethod
     def cat(cls, clouds: list[PointCloud]) -> PointCloud:
@@ -88,3 +99,8 @@ class PointCloud:
             torch.cat([c.intensity for c in clouds]),
             torch.cat([c.time_s for c in clouds]),
         )
+
+
+def _is_plain(x: Tensor) -> bool:
+    """Return whether compiled loops can read a tensor, and no gradient is lost by it."""
+    return x.device.type == "cpu" and x.dtype == torch.float32 and not x.requires_grad

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -62,6 +63,8 @@ class Transform:
     @classmethod
     def from_rpy(cls, translation: Tensor, roll: Tensor, pitch: Tensor, yaw: Tensor) -> Transform:
         """From intrinsic z-y-x angles in radians, right-handed: R = Rz(yaw) Ry(pitch) Rx(roll). Angles are (...)."""
+        if all(a.dim() == 0 and a.dtype == torch.float64 and not a.requires_grad for a in (roll, pitch, yaw)):
+            return cls(_rotate(torch.stack((roll, pitch, yaw))).to(translation.device), translation)
         cr, sr, cp, sp, cy, sy = roll.cos(), roll.sin(), pitch.cos(), pitch.sin(), yaw.cos(), yaw.sin()
         rows = (
             torch.stack((cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr), -1),
@@ -73,8 +76,13 @@ class Transform:
     @classmethod
     def from_xyz_yaw(cls, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Transform:
         """Return one upright pose, float64."""
-        zero = torch.zeros((), dtype=torch.float64)
-        return cls.from_rpy(torch.tensor([x, y, z], dtype=torch.float64), zero, zero, zero + yaw)
+        return cls.from_angles((x, y, z), (0.0, 0.0, yaw))
+
+    @classmethod
+    def from_angles(cls, xyz: Sequence[float], rpy: Sequence[float] | Tensor) -> Transform:
+        """Return one pose, float64, from numbers: place x, y, z, and roll, pitch, yaw as in :meth:`from_rpy`."""
+        angles = torch.as_tensor(rpy, dtype=torch.float64)
+        return cls(_rotate(angles), torch.tensor(xyz, dtype=torch.float64))
 
     @property
     def yaw(self) -> Tensor:
@@ -117,3 +125,17 @@ class Transform:
     def stack(cls, transforms: list[Transform] | tuple[Transform, ...]) -> Transform:
         """Return several motions of equal batch shape as one, new leading axis."""
         return cls(torch.stack([t.rotation for t in transforms]), torch.stack([t.translation for t in transforms]))
+
+
+def _rotate(rpy: Tensor) -> Tensor:
+    """Return the rotation (3, 3) of roll, pitch and yaw (3,), float64 on the CPU.
+
+    Products and sums are those of ``Transform.from_rpy``, on Python's numbers: same bits, a tenth of the time.
+    """
+    (cr, cp, cy), (sr, sp, sy) = rpy.cos().tolist(), rpy.sin().tolist()
+    rows = (
+        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        (-sp, cp * sr, cp * cr),
+    )
+    return torch.tensor(rows, dtype=torch.float64)

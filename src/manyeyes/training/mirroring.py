@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
@@ -18,7 +16,7 @@ def mirror_factors(flip: bool, dtype: torch.dtype) -> Tensor:
 
 def resize_cloud(cloud: PointCloud, scale: float, flip: bool) -> PointCloud:
     """Return the cloud in a scaled, mirrored frame."""
-    return replace(cloud, xyz=cloud.xyz * (mirror_factors(flip, cloud.xyz.dtype) * scale))
+    return cloud.scale((scale, -scale if flip else scale, scale))
 
 
 def resize_transform(motion: Transform, scale: float, flip: bool) -> Transform:

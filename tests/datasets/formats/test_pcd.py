@@ -284,3 +284,11 @@ def test_ascii_clouds_are_kept_until_the_file_changes(tmp_path: Path) -> None:
     entry = next((tmp_path / "cache").rglob("*.npy"))
     entry.write_bytes(entry.read_bytes()[:40])  # a damaged entry counts for nothing
     assert np.array_equal(read_pcd(path, cache=cache).xyz, 2 * first.xyz)
+
+
+def test_binary_clouds_are_read_without_the_cache(tmp_path: Path) -> None:
+    xyz, red = cloud(20)
+    write_pcd(tmp_path / "a.pcd", xyz, red / 255)
+    for _ in range(2):
+        assert np.array_equal(read_pcd(tmp_path / "a.pcd", cache=ArrayCache(tmp_path / "cache")).xyz, xyz)
+    assert not list((tmp_path / "cache").rglob("*.npy"))

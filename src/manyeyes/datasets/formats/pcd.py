@@ -67,13 +67,15 @@ def read_pcd(path: Path, drop_nan: bool = False, cache: ArrayCache | None = None
     A float intensity stands for itself, unless any value exceeds 1: then the file counts to 255. NaN points are an
     error unless drop_nan. With a cache, ascii files are parsed once and kept as float32 arrays.
     """
-    kept = cache.load(path, "pcd") if cache is not None and path.is_file() else None
+    header, body = _read(path)
+    # Binary files are read faster than the cache is asked.
+    is_slow = header.encoding == "ascii"
+    kept = cache.load(path, "pcd") if cache is not None and is_slow else None
     if kept is not None:
         cloud = PcdCloud(np.ascontiguousarray(kept[:, :3]), np.ascontiguousarray(kept[:, 3]))
     else:
-        header, table = _read(path)
-        cloud = _cloud(path, table)
-        if cache is not None and header.encoding == "ascii" and cloud.time_s is None:
+        cloud = _cloud(path, _parse_body(path, header, body))
+        if cache is not None and is_slow and cloud.time_s is None:
             cache.store(path, "pcd", np.concatenate((cloud.xyz, cloud.intensity[:, None]), 1))
     # The sum is a cheap first check: it is finite where every point is.
     if np.isfinite(cloud.xyz.sum(dtype=np.float64)):
@@ -89,7 +91,7 @@ def read_pcd(path: Path, drop_nan: bool = False, cache: ArrayCache | None = None
 
 def read_table(path: Path) -> PcdTable:
     """Read every field of a file, unchanged in type and unit."""
-    return _read(path)[1]
+    return _parse_body(path, *_read(path))
 
 
 def write_pcd(path: Path, xyz: np.ndarray, intensity: np.ndarray) -> None:
@@ -139,7 +141,8 @@ def write_table(path: Path, table: PcdTable) -> None:
     atomic_write(path, header.encode(), np.array([len(packed), len(plain)], "<u4").tobytes(), packed, durable=False)
 
 
-def _read(path: Path) -> tuple[_PcdHeader, PcdTable]:
+def _read(path: Path) -> tuple[_PcdHeader, memoryview]:
+    """Return the header of a file, and what follows it."""
     try:
         data = read_file(path)
     except FileNotFoundError:
@@ -149,12 +152,12 @@ def _read(path: Path) -> tuple[_PcdHeader, PcdTable]:
             f"{path}: cannot be read ({error.strerror}), expected a PCD point cloud; {_REMEDY}."
         ) from None
     header, start = _parse_header(path, data)
-    body = memoryview(data)[start:]
-    if header.encoding == "ascii":
-        return header, _ascii(path, header, body)
-    if header.encoding == "binary":
-        return header, _binary(path, header, body)
-    return header, _compressed(path, header, body)
+    return header, memoryview(data)[start:]
+
+
+def _parse_body(path: Path, header: _PcdHeader, body: memoryview) -> PcdTable:
+    parse = {"ascii": _ascii, "binary": _binary, "binary_compressed": _compressed}[header.encoding]
+    return parse(path, header, body)
 
 
 def _parse_header(path: Path, data: bytes) -> tuple[_PcdHeader, int]:

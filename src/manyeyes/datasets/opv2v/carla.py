@@ -11,7 +11,6 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from manyeyes.datatypes import Transform
 
@@ -19,8 +18,8 @@ from manyeyes.datatypes import Transform
 def transform_from_carla(pose: Sequence[float]) -> Transform:
     """Return world_from_body, float64, of a CARLA pose [x, y, z, roll, yaw, pitch] in metres and degrees."""
     x, y, z, roll, yaw, pitch = (float(v) for v in pose)
-    angles = torch.tensor([roll, -pitch, -yaw], dtype=torch.float64) * (math.pi / 180)
-    return Transform.from_rpy(torch.tensor([x, -y, z], dtype=torch.float64), angles[0], angles[1], angles[2])
+    degree = math.pi / 180
+    return Transform.from_angles((x, -y, z), (roll * degree, -pitch * degree, -yaw * degree))
 
 
 def carla_from_transform(world_from_body: Transform) -> tuple[float, ...]:

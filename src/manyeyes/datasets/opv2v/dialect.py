@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import torch
 
 from manyeyes.datasets.opv2v.carla import transform_from_carla
 from manyeyes.datatypes import Transform
@@ -65,8 +64,8 @@ class Dialect:
         if not self.is_right_handed:
             return transform_from_carla(pose)
         x, y, z, roll, yaw, pitch = (float(v) for v in pose)
-        angles = torch.tensor([-roll, -pitch, yaw], dtype=torch.float64) * (math.pi / 180)
-        return Transform.from_rpy(torch.tensor([x, y, z], dtype=torch.float64), angles[0], angles[1], angles[2])
+        degree = math.pi / 180
+        return Transform.from_angles((x, y, z), (-roll * degree, -pitch * degree, yaw * degree))
 
 
 OPV2V = Dialect("OPV2V")

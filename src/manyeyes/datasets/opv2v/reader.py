@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -114,8 +115,8 @@ class Opv2vRecording(RecordingReader):
             first = f"{problems[0]}{more}" if problems else "it is empty"
             raise RecordingError(f"{self.root}: expected whole scenarios; {first}. Download what is missing.")
         self._dialect, self._dialects = dialect, dict[str, Dialect]()
-        self._records: dict[Path, AgentRecord] = {}
-        self._poses: dict[tuple[Path, str], tuple[np.ndarray, np.ndarray, float]] = {}
+        self._records: dict[tuple[Path, str], AgentRecord] = {}
+        self._poses: dict[tuple[Path, str], _AgentPose] = {}
         self._lists: dict[tuple[str, int], MergedList] = {}
         self._protocols: dict[str, DataProtocol] = {}
         self._heights: dict[Path, float] = {}
@@ -151,7 +152,7 @@ class Opv2vRecording(RecordingReader):
         """Return the truth of a snapshot's frames."""
         if (scenario, index) not in self._lists:
             stem, present = self._present(scenario, index)
-            records = [self._record(agent.folder / f"{stem}.yaml") for agent in present]
+            records = [self._record(agent, stem) for agent in present]
             if len(self._lists) >= _MAX_CACHED_RECORDS:
                 self._lists.clear()
             self._lists[scenario, index] = merge_lists(records, [agent.id for agent in present], self.dialect(scenario))
@@ -178,7 +179,7 @@ class Opv2vRecording(RecordingReader):
     def _try_record(self, agent: AgentFiles, stem: str) -> AgentRecord | None:
         """Return a frame's metadata; None where they are damaged, which is an error of that frame alone."""
         try:
-            return self._record(agent.folder / f"{stem}.yaml")
+            return self._record(agent, stem)
         except RecordingError:
             return None
 
@@ -250,12 +251,13 @@ class Opv2vRecording(RecordingReader):
         has_protocol = (self._scenario(scenario).folder / PROTOCOL).is_file()
         return self._protocol(scenario).fixed_delta_s if has_protocol else self.dialect(scenario).delta_s
 
-    def _record(self, path: Path) -> AgentRecord:
-        if path not in self._records:
+    def _record(self, agent: AgentFiles, stem: str) -> AgentRecord:
+        key = agent.folder, stem
+        if key not in self._records:
             if len(self._records) >= _MAX_CACHED_RECORDS:
                 self._records.clear()
-            self._records[path] = read_record(path, self._cache)
-        return self._records[path]
+            self._records[key] = read_record(agent.folder / f"{stem}.yaml", self._cache)
+        return self._records[key]
 
     def _cloud(self, agent: AgentFiles, stem: str) -> PcdCloud:
         path = agent.cloud_path(stem)
@@ -271,10 +273,10 @@ class Opv2vRecording(RecordingReader):
     def _frame(
         self, scenario: str, agent: AgentFiles, stem: str, images: bool, is_deferred: bool = False
     ) -> AgentFrame:
-        yaml = agent.folder / f"{stem}.yaml"
-        record = self._record(yaml)
+        record = self._record(agent, stem)
         dialect = self.dialect(scenario)
-        world_from_agent, height = self._pose(agent, stem, dialect)
+        pose = self._pose(agent, stem, dialect)
+        world_from_agent, height = pose.copy(), pose.height_m
         read = partial(self._points, agent, stem, height, dialect.is_right_handed)
         return AgentFrame(
             agent_id=agent.id,
@@ -285,22 +287,23 @@ class Opv2vRecording(RecordingReader):
             sensor_height_m=height,
             speed_mps=record.speed_kmh / KMH_PER_MPS,
             is_infrastructure=record.is_infrastructure,
-            body=None if dialect.is_right_handed else _carla_body(record, world_from_agent),
-            images=read_images(yaml, world_from_agent, self._cache) if images else (),
+            body=pose.body,
+            images=read_images(agent.folder / f"{stem}.yaml", world_from_agent, self._cache) if images else (),
         )
 
-    def _pose(self, agent: AgentFiles, stem: str, dialect: Dialect) -> tuple[Transform, float]:
-        """Return the pose of an agent's frame, and the height of its LiDAR above the road."""
-        if (agent.folder, stem) not in self._poses:
-            record = self._record(agent.folder / f"{stem}.yaml")
+    def _pose(self, agent: AgentFiles, stem: str, dialect: Dialect) -> _AgentPose:
+        """Return where an agent's frame is; computed once and kept."""
+        key = agent.folder, stem
+        if key not in self._poses:
+            record = self._record(agent, stem)
             world_from_lidar = dialect.world_from_lidar(record.lidar_pose)
             height = self._sensor_height(agent, record, world_from_lidar, dialect)
             pose = world_from_lidar @ Transform.from_xyz_yaw(0, 0, -height)
             if len(self._poses) >= _MAX_CACHED_RECORDS:
                 self._poses.clear()
-            self._poses[agent.folder, stem] = (pose.rotation.numpy(), pose.translation.numpy(), height)
-        rotation, translation, height = self._poses[agent.folder, stem]
-        return Transform(torch.from_numpy(rotation.copy()), torch.from_numpy(translation.copy())), height
+            body = None if dialect.is_right_handed else _carla_body(record, pose)
+            self._poses[key] = _AgentPose(pose.rotation.numpy(), pose.translation.numpy(), height, body)
+        return self._poses[key]
 
     def _sensor_height(
         self, agent: AgentFiles, record: AgentRecord, world_from_lidar: Transform, dialect: Dialect
@@ -316,6 +319,20 @@ class Opv2vRecording(RecordingReader):
         if agent.folder not in self._heights:
             self._heights[agent.folder] = estimate_sensor_height(self._cloud(agent, min(agent.stems)).xyz)
         return self._heights[agent.folder]
+
+
+@dataclass(frozen=True)
+class _AgentPose:
+    """Where an agent's frame is: rotation (3, 3) and translation (3,) of world_from_agent, height of the LiDAR, and the body."""
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    height_m: float
+    body: AgentBody | None
+
+    def copy(self) -> Transform:
+        """Return world_from_agent, in memory of its own."""
+        return Transform(torch.from_numpy(self.rotation.copy()), torch.from_numpy(self.translation.copy()))
 
 
 def _stated_height(record: AgentRecord, world_from_lidar: Transform) -> float | None:

@@ -241,6 +241,7 @@ class _AugmentedScene:
         self._moments, self._rng, self._config, self._leveller = moments, rng, config, leveller
         ids = tuple(frame.agent_id for frame in moments[-1].frames)
         self._poses: dict[tuple[int, int], Transform] = {}
+        self._agents_from_view: dict[tuple[int, int], Transform] = {}
         self._turn = {
             agent_id: Transform.from_xyz_yaw(0, 0, 0, config.max_yaw_rad * rng.uniform(-1, 1)) for agent_id in ids
         }
@@ -269,11 +270,14 @@ class _AugmentedScene:
 
     def _agent_from_view(self, back: int, row: int) -> Transform:
         """Return the motion from the levelled and rotated frame of an agent to its frame in the recording."""
-        snapshot = self._moments[-1 - back]
-        frame = snapshot.frames[row]
-        levelled_from_agent = None if self._leveller is None else self._leveller.find(snapshot, frame)
-        turn = self._turn[frame.agent_id]
-        return turn if levelled_from_agent is None else levelled_from_agent.inverse() @ turn
+        if (back, row) not in self._agents_from_view:
+            snapshot = self._moments[-1 - back]
+            frame = snapshot.frames[row]
+            levelled_from_agent = None if self._leveller is None else self._leveller.find(snapshot, frame)
+            turn = self._turn[frame.agent_id]
+            motion = turn if levelled_from_agent is None else levelled_from_agent.inverse() @ turn
+            self._agents_from_view[back, row] = motion
+        return self._agents_from_view[back, row]
 
     def cloud(self, back: int, agent_id: int) -> PointCloud | None:
         """Return the agent's sweep in its rotated frame at that time, with points dropped out."""
