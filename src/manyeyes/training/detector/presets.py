@@ -134,11 +134,12 @@ DETECTOR_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {
         augment=AugmentConfig(max_agents=3),
     ),
 }
-"""costr-small/stage1 to stage4, each initialised with the weights of the stage before: stage2 adds the wider range, all agents
-and the IoU loss; stage3 adds history, delay, pose errors, packet loss, budgets, and drawn sensors and intensity laws; stage4
-prunes more cells, object by object; stage5 and stage6 repeat both at twice the range; stage7 repeats stage6 with larger batches.
-ablation/*: rows of the ablation, each trained on from the shipped weights for the same number of steps. costr-opv2v,
-costr-v2xset, costr-dair and costr-v2x-real: the published data sets, 80 + 10 epochs as in the paper. costr-tiny: tests and examples.
+"""costr-small/stage1 to stage4, each initialised with the weights of the stage before: stage2 adds the wider range, all
+agents and the IoU loss; stage3 adds history, delay, pose errors, packet loss, budgets, and drawn sensors and intensity laws;
+stage4 prunes more cells, object by object; stage5 and stage6 repeat both at twice the range; stage7 repeats stage6 with
+larger batches. ablation/*: rows of the ablation, each trained on from the shipped weights for the same number of steps.
+costr-opv2v, costr-v2xset, costr-dair and costr-v2x-real: the published data sets, 80 + 10 epochs as in the paper. costr-tiny:
+tests and examples.
 """
 
 
