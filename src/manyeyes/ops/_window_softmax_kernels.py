@@ -170,16 +170,15 @@ def _exponentials(x: F32x1, rows: int, vectors: int, sums: F32x1) -> None:  # pr
         _exponentiate_columns(x, rows, vectors * LANES, vector * LANES, sums)
 
 
-@intrinsic
-def _exponentiate_columns(_: Any, x: Any, rows: Any, wide: Any, first: Any, sums: Any) -> Any:
-    """Do the same with LANES columns from first on, as ``power_of_two``.
+def _make_exponentials(_: Any, x: Any, rows: Any, wide: Any, first: Any, sums: Any) -> Any:
+    """x (rows, wide) and sums, with LANES columns from first on, as ``_exponentials`` by ``power_of_two``.
 
     Written for LLVM in vectors: a compiler that does not know x and sums apart leaves such a loop to single numbers.
     """
     vector, words = ir.VectorType(ir.FloatType(), LANES), ir.VectorType(ir.IntType(32), LANES)
     fast = ["contract", "nsz", "nnan", "ninf"]
 
-    def constant(value: float) -> Any:
+    def constant(value: Any) -> Any:
         return ir.Constant(vector, [float(value)] * LANES)
 
     def generate(context: Any, b: Any, signature: Any, given: Any) -> Any:
@@ -218,6 +217,9 @@ def _exponentiate_columns(_: Any, x: Any, rows: Any, wide: Any, first: Any, sums
         return context.get_dummy_value()
 
     return types.void(x, types.intp, types.intp, types.intp, sums), generate
+
+
+_exponentiate_columns: Any = intrinsic(_make_exponentials)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
