@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from tests.agents.trust.street import SEEN, SEEN_TOO, Street, cars, sender
 
+from manyeyes.agents.trust._claim_offset_kernels import list_pairs, score_shift
 from manyeyes.agents.trust.claim_offset import OffsetConfig, find_offset
 from manyeyes.agents.trust.claims import Claims
-from manyeyes.agents.trust.copies import CopyConfig, StatedContent, add_contents, find_copies, is_equal
+from manyeyes.agents.trust.copies import CopyConfig, StatedContent, add_contents, find_copies
 from manyeyes.agents.trust.detectors.ray_evidence import RayEvidenceDetector
 from manyeyes.agents.trust.interface import SenderStatus
 
@@ -76,6 +77,17 @@ def test_a_displaced_pose_is_a_fault_without_weight_and_no_accusation():
     assert (back.status, back.weight) == (SenderStatus.NORMAL, 1.0)
 
 
+def test_the_agreement_is_that_of_all_pairs():
+    """The compiled loop with lists of pairs, against all pairs of claims and detections."""
+    claims, seen = scattered(7, 15), scattered(8, 15)
+    for shift in scattered(9, 20) / 10.0:
+        distance = np.linalg.norm(seen[None] - claims[:, None] - shift, axis=2)
+        expected = (1 - (distance.min(1).clip(max=12.0) / 12.0) ** 2).sum()
+        first, offsets = list_pairs(claims, seen, 100.0)
+        score, number, _ = score_shift(first, offsets, np.zeros((15, 2)), *shift, 12.0)
+        assert score == pytest.approx(expected) and number == (distance.min(1) < 12.0).sum() > 0
+
+
 def stated(agent_id: int, xy: np.ndarray) -> Claims:
     one = Claims.of(agent_id, cars(*map(tuple, xy)), np.full(len(xy), 0.1))
     return replace(one, stated_xy=xy)
@@ -96,10 +108,12 @@ def test_a_message_that_was_compared_before_and_own_content_are_no_copies():
 
 
 def test_few_equal_positions_are_chance():
-    xy = scattered(1, 6)
-    assert not is_equal(xy[:2], xy[:2], CopyConfig())
-    assert not is_equal(xy, np.concatenate((xy[:3], xy[3:] + 1.0)), CopyConfig())
-    assert is_equal(xy, np.concatenate((xy[:4], xy[4:] + 1.0)), CopyConfig())
+    config, xy = CopyConfig(), scattered(1, 6)
+    half = np.concatenate((xy[:3], xy[3:] + 1.0))
+    most = np.concatenate((xy[:4], xy[4:] + 1.0))
+    for other, num_known, expected in ((xy, 2, {}), (half, 6, {}), (most, 6, {1: 2}), (xy, 6, {1: 2})):
+        earlier = {2: (StatedContent(100, other[:num_known]),)}
+        assert find_copies((stated(1, xy[:num_known]),), (200,), earlier, config) == expected
 
 
 def test_the_contents_of_the_last_messages_are_kept_once():

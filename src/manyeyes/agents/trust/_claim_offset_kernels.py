@@ -7,26 +7,45 @@ import math
 
 import numpy as np
 
-from manyeyes._jit import F64x1, F64x2, njit
+from manyeyes._jit import F64x1, F64x2, I64x1, njit
+
+NEAR_M, MIN_UNMOVED = 3.5, 0.5
+"""There is no offset where the agreement without one is one more than MIN_UNMOVED of the claims within NEAR_M of a detection."""
+
+
+@njit(cache=True, nogil=True)
+def list_pairs(claims: F64x2, detections: F64x2, radius_m: float) -> tuple[I64x1, F64x2]:  # pragma: no cover
+    """Return the first pair (N + 1) of each claim (N, 2), and the offsets (P, 2) to detections (K, 2) within a radius."""
+    first, count = np.zeros(len(claims) + 1, np.int64), 0
+    offsets = np.empty((len(claims) * len(detections), 2))
+    for i in range(len(claims)):
+        for j in range(len(detections)):
+            dx, dy = detections[j, 0] - claims[i, 0], detections[j, 1] - claims[i, 1]
+            if dx * dx + dy * dy <= radius_m * radius_m:
+                offsets[count, 0], offsets[count, 1] = dx, dy
+                count += 1
+        first[i + 1] = count
+    return first, offsets[:count]
 
 
 @njit(cache=True, nogil=True)
 def score_shift(
-    claims: F64x2, turned: F64x2, detections: F64x2, shift_x: float, shift_y: float, tolerance_m: float
+    first: I64x1, offsets: F64x2, turned: F64x2, shift_x: float, shift_y: float, tolerance_m: float
 ) -> tuple[float, int, float]:  # pragma: no cover
-    """Return the agreement of turned claims (N, 2) with detections (K, 2) after a shift, the number of claims that agree, and their
-    mean displacement from where they were stated. A claim at a distance d adds 1 - (d / tolerance_m)^2.
+    """Return the agreement of claims after a shift, the number of claims that agree, and the mean of their displacements.
+
+    turned: (N, 2) what a turn adds to each claim. A claim that is a distance d from a detection then adds 1 - (d / tolerance_m)^2.
     """
     score, number, moved, bound = 0.0, 0, 0.0, tolerance_m * tolerance_m
-    for i in range(len(claims)):
+    for i in range(len(turned)):
         best, row = bound, -1
-        for j in range(len(detections)):
-            dx, dy = detections[j, 0] - turned[i, 0] - shift_x, detections[j, 1] - turned[i, 1] - shift_y
+        for k in range(first[i], first[i + 1]):
+            dx, dy = offsets[k, 0] - turned[i, 0] - shift_x, offsets[k, 1] - turned[i, 1] - shift_y
             if dx * dx + dy * dy < best:
-                best, row = dx * dx + dy * dy, j
+                best, row = dx * dx + dy * dy, k
         if row >= 0:
             score, number = score + 1.0 - best / bound, number + 1
-            moved += math.hypot(detections[row, 0] - claims[i, 0], detections[row, 1] - claims[i, 1])
+            moved += math.hypot(offsets[row, 0], offsets[row, 1])
     return score, number, moved / max(number, 1)
 
 
@@ -40,33 +59,29 @@ def search_offset(
     to max_offset_m, the best of larger ones, and the number of pairs and the displacement of the latter.
     """
     search_m, tolerance_m, max_offset_m, ratio, margin = limits
-    near, _, _ = score_shift(claims, claims, detections, 0.0, 0.0, tolerance_m)
-    far, far_pairs, far_m = 0.0, 0, 0.0
-    reachable = np.zeros(len(claims), np.bool_)
+    first, offsets = list_pairs(claims, detections, search_m)
+    turned = np.zeros_like(claims)
+    near, _, _ = score_shift(first, offsets, turned, 0.0, 0.0, tolerance_m)
+    far, far_pairs, far_m, num_reachable, num_near = 0.0, 0, 0.0, 0, 0
     for i in range(len(claims)):
-        for j in range(len(detections)):
-            dx, dy = detections[j, 0] - claims[i, 0], detections[j, 1] - claims[i, 1]
-            if dx * dx + dy * dy <= search_m * search_m:
-                reachable[i] = True
+        num_reachable += first[i + 1] > first[i]
+        for k in range(first[i], first[i + 1]):
+            if offsets[k, 0] * offsets[k, 0] + offsets[k, 1] * offsets[k, 1] <= NEAR_M * NEAR_M:
+                num_near += 1
                 break
-    kept = claims[reachable]
-    # No offset can do better than all claims that have a detection within reach.
-    if near * ratio + margin >= len(kept):
+    # No offset can do better than all claims that have a detection within reach; and where most of those near a detection are at
+    # their place, there is no offset.
+    if near * ratio + margin >= num_reachable or near >= MIN_UNMOVED * num_near + 1.0:
         return near, far, far_pairs, far_m
-    turned = np.empty_like(kept)
     for turn in turns:
-        cosine, sine = math.cos(turn), math.sin(turn)
-        for i in range(len(kept)):
-            dx, dy = kept[i, 0] - pivot[0], kept[i, 1] - pivot[1]
-            turned[i, 0] = pivot[0] + dx * cosine - dy * sine
-            turned[i, 1] = pivot[1] + dx * sine + dy * cosine
-        for i in range(len(kept)):
-            for j in range(len(detections)):
-                dx, dy = detections[j, 0] - kept[i, 0], detections[j, 1] - kept[i, 1]
-                if dx * dx + dy * dy > search_m * search_m:
-                    continue
-                shift_x, shift_y = detections[j, 0] - turned[i, 0], detections[j, 1] - turned[i, 1]
-                score, pairs, moved = score_shift(kept, turned, detections, shift_x, shift_y, tolerance_m)
+        cosine, sine = math.cos(turn) - 1.0, math.sin(turn)
+        for i in range(len(claims)):
+            dx, dy = claims[i, 0] - pivot[0], claims[i, 1] - pivot[1]
+            turned[i, 0], turned[i, 1] = dx * cosine - dy * sine, dx * sine + dy * cosine
+        for i in range(len(claims)):
+            for k in range(first[i], first[i + 1]):
+                shift_x, shift_y = offsets[k, 0] - turned[i, 0], offsets[k, 1] - turned[i, 1]
+                score, pairs, moved = score_shift(first, offsets, turned, shift_x, shift_y, tolerance_m)
                 if moved <= max_offset_m:
                     near = max(near, score)
                 elif score > far:

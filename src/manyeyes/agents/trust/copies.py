@@ -9,7 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from manyeyes.agents.trust.association import Floats, associate
+import numpy as np
+
+from manyeyes.agents.trust.association import Floats, find_nearest
 from manyeyes.agents.trust.claims import Claims
 
 NUM_KEPT = 4
@@ -48,30 +50,28 @@ def find_copies(
     A message is compared with the messages of other senders from earlier frames. Senders that state equal content in the same frame
     for the first time are both left: nothing shows which of them copied.
     """
+    contents = [(agent_id, content.xy) for agent_id, kept in earlier.items() for content in kept]
+    if not contents:
+        return {}
+    places, sizes = np.concatenate([xy for _, xy in contents]), np.array([len(xy) for _, xy in contents])
+    agents, row_of_place = np.array([agent_id for agent_id, _ in contents]), np.repeat(np.arange(len(sizes)), sizes)
     found = dict[int, int]()
     for one, time_ns in zip(claims, times_ns):
-        known = earlier.get(one.agent_id, ())
-        if one.stated_xy is None or len(one.stated_xy) < config.min_equal or is_known(known, time_ns):
+        xy = one.stated_xy
+        if xy is None or len(xy) < config.min_equal or is_known(earlier.get(one.agent_id, ()), time_ns):
             continue
-        for agent_id, contents in earlier.items():
-            if agent_id != one.agent_id and any(is_equal(one.stated_xy, other.xy, config) for other in contents):
-                found[one.agent_id] = agent_id
-                break
+        is_other = agents[row_of_place] != one.agent_id
+        nearest = find_nearest(xy, places[is_other], config.equal_m)
+        equal = np.bincount(row_of_place[is_other][nearest[nearest >= 0]], minlength=len(sizes))
+        is_copied = (equal >= config.min_equal) & (equal > config.max_copied * np.minimum(len(xy), sizes))
+        if is_copied.any():
+            found[one.agent_id] = int(agents[int(np.argmax(is_copied))])
     return found
 
 
 def is_known(contents: Sequence[StatedContent], time_ns: int) -> bool:
     """Return whether a message was compared in an earlier frame."""
     return any(content.timestamp_ns == time_ns for content in contents)
-
-
-def is_equal(one: Floats, other: Floats, config: CopyConfig) -> bool:
-    """Return whether most of the fewer positions, (N, 2) and (M, 2), are equal."""
-    fewest = min(len(one), len(other))
-    if fewest < config.min_equal:
-        return False
-    num_equal = int((associate(one, other, config.equal_m) >= 0).sum())
-    return num_equal >= config.min_equal and num_equal > config.max_copied * fewest
 
 
 def add_contents(earlier: tuple[StatedContent, ...], one: Claims, time_ns: int) -> tuple[StatedContent, ...]:
