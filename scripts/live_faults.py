@@ -9,17 +9,15 @@ Faults of packets, certificates, weights and full disks do not need processes: t
 
 from __future__ import annotations
 
-import json
 import os
 import signal
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import tyro
-from live_team import PLACE, Team, TeamConfig, Tick, open_network, rss_bytes
+from live_team import PLACE, Team, Tick, open_network, rss_bytes, start_team, write_result
 from rich.console import Console
 from rich.table import Table
 
@@ -230,10 +228,8 @@ def main(options: Options) -> None:
     """Run the rows, and print their table."""
     outcomes, load = list[Outcome](), os.getloadavg()[0]
     for name in options.rows:
-        with tempfile.TemporaryDirectory() as folder:
-            config = TeamConfig(Path(folder), options.agents, options.transport, options.rate)
-            with Team(config) as team:
-                outcomes.append(ROWS[name](team, options))
+        with start_team(options.agents, options.transport, options.rate) as team:
+            outcomes.append(ROWS[name](team, options))
     table = Table("fault", "bar", "result", "", box=None)
     for one in outcomes:
         table.add_row(one.fault, one.bar, one.result, "met" if one.passed else "NOT MET")
@@ -241,9 +237,8 @@ def main(options: Options) -> None:
     print(
         f"{options.agents} processes, {options.transport}, rate {options.rate:g}; load of the machine before: {load:.1f}"
     )
-    if options.out is not None:
-        rows = {"load_before": load, "rate": options.rate, "rows": [asdict(one) for one in outcomes]}
-        options.out.write_text(json.dumps(rows, indent=2) + "\n")
+    rows = {"load_before": load, "rate": options.rate, "rows": [asdict(one) for one in outcomes]}
+    write_result(rows, options.out)
 
 
 if __name__ == "__main__":

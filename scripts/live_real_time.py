@@ -11,14 +11,12 @@ import contextlib
 import json
 import os
 import socket
-import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import tyro
-from live_team import PLACE, Team, TeamConfig, Tick, free_port
+from live_team import PLACE, Tick, free_port, quantiles_ms, start_team, summarise, write_result
 
 from manyeyes.comms.network.interface import Network
 from manyeyes.runtime.transports.udp import UdpConfig, UdpNetwork
@@ -43,13 +41,6 @@ class Options:
     """Their length."""
     out: Path | None = None
     """Write the result as JSON."""
-
-
-def quantiles_ms(values_ns: list[int]) -> dict[str, float]:
-    """Return p50, p95 and p99, ms."""
-    if not values_ns:
-        return {}
-    return {f"p{q}": round(float(np.quantile(values_ns, q / 100)) / 1e6, 3) for q in (50, 95, 99)}
 
 
 def open_pair(transport: str) -> tuple[Network, Network]:
@@ -104,27 +95,20 @@ def main(options: Options) -> None:
     """Run both measurements, and print them."""
     load = os.getloadavg()[0]
     through, raw = measure_transport(options.transport, options.packets, options.packet_bytes)
-    with tempfile.TemporaryDirectory() as folder:
-        config = TeamConfig(Path(folder), 2, options.transport, 1.0, options.weights, options.recording)
-        with Team(config) as team:
-            found = team.collect(60 * options.minutes)
+    with start_team(2, options.transport, 1.0, options.weights, options.recording) as team:
+        found = team.collect(60 * options.minutes)
     ticks: list[Tick] = [tick for one in found.values() for tick in one]
     result = {
         "transport": options.transport,
         "weights": options.weights,
         "load_before": load,
-        "frames": len(ticks),
-        "missed_fraction": sum(tick.missed for tick in ticks) / max(len(ticks), 1),
-        "level_0_fraction": sum(tick.level == 0 for tick in ticks) / max(len(ticks), 1),
-        "boxes_ms": quantiles_ms([tick.latency_ns for tick in ticks]),
-        "age_ms": quantiles_ms([age for tick in ticks for age in tick.ages_ns]),
+        **summarise(ticks),
         "transport_ms": quantiles_ms(through),
         "raw_datagrams_ms": quantiles_ms(raw),
         "packets": len(through),
     }
     print(json.dumps(result, indent=2))
-    if options.out is not None:
-        options.out.write_text(json.dumps(result, indent=2) + "\n")
+    write_result(result, options.out)
 
 
 if __name__ == "__main__":

@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 import tyro
-from live_team import Team, TeamConfig, Tick, rss_bytes
+from live_team import Team, Tick, rss_bytes, start_team, summarise, write_result
 from numpy.typing import NDArray
 
 MB, SAMPLE_S, BLOCK_S, NUM_DRAWS, MAX_POINTS = 1 << 20, 5.0, 60.0, 500, 400
@@ -100,13 +99,12 @@ class _Samples:
             self.pss_mb[agent_id].append(pss / MB)
 
 
-def run_team(options: Options, folder: Path) -> tuple[_Samples, list[Tick], int]:
+def run_team(options: Options) -> tuple[_Samples, list[Tick], int]:
     """Run the team; return samples of memory, all ticks of agents that stay, and the number of departures."""
     stable, changing = range(1, options.agents), options.agents
     samples = _Samples([], {k: [] for k in stable}, {k: [] for k in stable})
     ticks, departures = list[Tick](), 0
-    config = TeamConfig(folder, options.agents, options.transport, options.rate, options.weights, options.recording)
-    with Team(config) as team:
+    with start_team(options.agents, options.transport, options.rate, options.weights, options.recording) as team:
         began_s = changed_s = time.monotonic()
         while (now_s := time.monotonic()) - began_s < 60 * options.minutes:
             found = team.collect(min(SAMPLE_S, options.turnover_s) * options.rate)
@@ -125,8 +123,7 @@ def run_team(options: Options, folder: Path) -> tuple[_Samples, list[Tick], int]
 def main(options: Options) -> None:
     """Run the soak, and print what it found."""
     load = os.getloadavg()[0]
-    with tempfile.TemporaryDirectory() as folder:
-        samples, ticks, departures = run_team(options, Path(folder))
+    samples, ticks, departures = run_team(options)
     time_s = np.array(samples.time_s)
     warm = time_s >= 60 * options.warm_up_minutes
     slopes = {
@@ -134,8 +131,6 @@ def main(options: Options) -> None:
         for agent_id, values in samples.rss_mb.items()
         if warm.sum() > 2
     }
-    ages = [age / 1e6 for tick in ticks for age in tick.ages_ns]
-    latency = [tick.latency_ns / 1e6 for tick in ticks]
     late = [tick for tick in ticks if tick.time_s - ticks[0].time_s >= 60 * options.warm_up_minutes] or ticks
     result = {
         "minutes": options.minutes,
@@ -145,10 +140,7 @@ def main(options: Options) -> None:
         "weights": options.weights,
         "load_before": load,
         "departures": departures,
-        "frames": len(ticks),
-        "missed_fraction": sum(tick.missed for tick in ticks) / max(len(ticks), 1),
-        "age_ms_p50_p95": np.quantile(ages, (0.5, 0.95)).round(1).tolist() if ages else None,
-        "latency_ms_p50_p95": np.quantile(latency, (0.5, 0.95)).round(1).tolist() if latency else None,
+        **summarise(ticks),
         "rss_mb_per_h": {name: asdict(slope) for name, slope in slopes.items()},
         "rss_mb_last": {str(k): round(values[-1], 1) for k, values in samples.rss_mb.items()},
         "pss_mb_last": {str(k): round(values[-1], 1) for k, values in samples.pss_mb.items()},
@@ -156,8 +148,7 @@ def main(options: Options) -> None:
         "files": [min(tick.num_files for tick in late), max(tick.num_files for tick in late)],
     }
     print(json.dumps(result, indent=2))
-    if options.out is not None:
-        options.out.write_text(json.dumps(result, indent=2) + "\n")
+    write_result(result, options.out)
 
 
 if __name__ == "__main__":

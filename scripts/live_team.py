@@ -8,13 +8,15 @@ cores; ``weights`` takes a real one, on the frames of a recording.
 from __future__ import annotations
 
 import contextlib
+import json
 import multiprocessing
 import os
 import signal
 import socket
+import tempfile
 import threading
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -31,6 +33,7 @@ from manyeyes.runtime.federation import make_demo_federation
 from manyeyes.runtime.live import LiveRun, LiveTick
 from manyeyes.runtime.pseudonyms import PseudonymPool
 from manyeyes.runtime.security import Security
+from manyeyes.runtime.summary import Quantiles
 from manyeyes.runtime.transports.faulty import FaultPlan, FaultyNetwork
 from manyeyes.runtime.transports.udp import UdpConfig, UdpNetwork
 from manyeyes.runtime.transports.zenoh import ZenohConfig, ZenohNetwork
@@ -264,6 +267,46 @@ class Team:
             if all(last.get(agent_id) == everyone - {agent_id} for agent_id in everyone):
                 return
         raise TimeoutError(f"After {timeout_s:.0f} s agents fuse {last}; the machine may be too slow: give --rate.")
+
+
+@contextlib.contextmanager
+def start_team(
+    num_agents: int,
+    transport: str,
+    rate: float = 1.0,
+    weights: str | None = None,
+    recording: tuple[str, str] | None = None,
+) -> Iterator[Team]:
+    """Run a team with keys in a folder that is removed at the end."""
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        yield stack.enter_context(Team(TeamConfig(folder, num_agents, transport, rate, weights, recording)))
+
+
+def quantiles_ms(values_ns: list[int]) -> dict[str, float]:
+    """Return p50, p95 and p99, ms; nothing of nothing."""
+    if not values_ns:
+        return {}
+    found = Quantiles.of(values_ns)
+    return {"p50": found.p50_ms, "p95": found.p95_ms, "p99": found.p99_ms}
+
+
+def summarise(ticks: Sequence[Tick]) -> dict[str, Any]:
+    """Return frames, fractions of missed deadlines and of level 0, and the times of boxes and ages, ms."""
+    num = max(len(ticks), 1)
+    return {
+        "frames": len(ticks),
+        "missed_fraction": sum(tick.missed for tick in ticks) / num,
+        "level_0_fraction": sum(tick.level == 0 for tick in ticks) / num,
+        "boxes_ms": quantiles_ms([tick.latency_ns for tick in ticks]),
+        "age_ms": quantiles_ms([age for tick in ticks for age in tick.ages_ns]),
+    }
+
+
+def write_result(result: dict[str, Any], out: Path | None) -> None:
+    """Write a result as JSON, where a file is given."""
+    if out is not None:
+        out.write_text(json.dumps(result, indent=2) + "\n")
 
 
 def rss_bytes(process: Any) -> tuple[int, int]:

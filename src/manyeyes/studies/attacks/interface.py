@@ -120,6 +120,14 @@ class Attack(Protocol):
         ...
 
 
+@dataclass(frozen=True, kw_only=True)
+class AttackSettings:
+    """Settings that every attack of the families has, as of ``Attack``."""
+
+    num_pseudonyms: int = 0
+    knowledge: Knowledge = "black-box"
+
+
 def send_honestly(given: AttackInput) -> AttackOutput:
     """Return the honest message itself, the same object."""
     return AttackOutput(given.message)

@@ -20,20 +20,18 @@ from manyeyes.studies.attacks.interface import (
     AttackInput,
     AttackKey,
     AttackOutput,
+    AttackSettings,
     FalseClaims,
-    Knowledge,
 )
 from manyeyes.studies.attacks.message_edit import insert_object, remove_objects, template_at
 
 
 @dataclass(frozen=True)
-class ObjectShiftAttack:
+class ObjectShiftAttack(AttackSettings):
     """Report the object nearest to the victim displaced by distance_m, and turned by yaw_deg."""
 
     distance_m: float = 2.0
     yaw_deg: float = 0.0
-    num_pseudonyms: int = 0
-    knowledge: Knowledge = "black-box"
 
     def begin(self, key: AttackKey) -> AlterMessage:
         """Return the attack of one malicious agent."""
@@ -62,14 +60,12 @@ class _ObjectShift:
 
 
 @dataclass(frozen=True)
-class PoseShiftAttack:
+class PoseShiftAttack(AttackSettings):
     """State a pose displaced by distance_m and turned by yaw_deg, or one that drifts by drift_mps from the true one."""
 
     distance_m: float = 0.0
     yaw_deg: float = 0.0
     drift_mps: float = 0.0
-    num_pseudonyms: int = 0
-    knowledge: Knowledge = "black-box"
 
     def begin(self, key: AttackKey) -> AlterMessage:
         """Return the attack of one malicious agent."""

@@ -15,8 +15,8 @@ from manyeyes.studies.attacks.interface import (
     AttackInput,
     AttackKey,
     AttackOutput,
+    AttackSettings,
     FalseClaims,
-    Knowledge,
 )
 from manyeyes.studies.attacks.message_edit import CAR_SIZE, find_template, insert_object
 
@@ -25,13 +25,11 @@ MIN_RADIUS_M = 6.0
 
 
 @dataclass(frozen=True)
-class FloodAttack:
+class FloodAttack(AttackSettings):
     """Send num_objects false cars around the victim, in new places in every message."""
 
     num_objects: int = 64
     score: float = 0.99
-    num_pseudonyms: int = 0
-    knowledge: Knowledge = "black-box"
 
     def begin(self, key: AttackKey) -> AlterMessage:
         """Return the attack of one malicious agent."""
