@@ -2,6 +2,9 @@
 """What is written can be read by the programs it is written for, in the right place on earth, and loses nothing it should keep."""
 
 import json
+import sqlite3
+import xml.etree.ElementTree as ET
+from contextlib import closing
 from dataclasses import fields, replace
 
 import numpy as np
@@ -109,6 +112,52 @@ def test_geopandas_reads_all_elements_in_their_place_on_earth(two_lanes, tmp_pat
     first = found[ids[1]]
     assert (first.kind, first.state, first.style) == ("divider", "published", "dashed")
     assert first.supporters == 2 and first.confidence == pytest.approx(1 / (1 + np.exp(-m.log_odds[1])), abs=1e-6)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:25832", "local"])
+def test_a_geopackage_in_metres_holds_the_same_places_with_a_style_of_each_layer(two_lanes, tmp_path, crs):
+    geopandas = pytest.importorskip("geopandas", reason="the map extra is not installed")
+    m, path = two_lanes(-300.0, 500.0), tmp_path / "m.gpkg"
+    export_map(m, path, crs=crs)
+    lines = geopandas.read_file(path, layer="lines")
+    assert lines.crs.is_projected and lines.crs.axis_info[0].unit_name == "metre"
+    assert crs == "local" or lines.crs.to_epsg() == 25832
+    placed = dict(zip(lines["id"], lines.to_crs(m.frame.proj).geometry))
+    for row, name in enumerate(to_hex_ids(m.id)):
+        if m.elements.kind[row] != CROSSING:
+            want = shapely.LineString(m.elements.polyline(row))
+            assert shapely.hausdorff_distance(placed[name], want) < 0.002
+    if crs == "local":
+        np.testing.assert_array_equal(shapely.get_coordinates(lines.geometry[0]), m.elements.polyline(0))
+    with closing(sqlite3.connect(path)) as data:
+        styles = dict(data.execute("SELECT f_table_name, styleQML FROM layer_styles WHERE useAsDefault = 1").fetchall())
+        (kind,) = data.execute("SELECT data_type FROM gpkg_contents WHERE table_name = 'layer_styles'").fetchone()
+        columns = dict(data.execute("SELECT table_name, column_name FROM gpkg_geometry_columns").fetchall())
+    assert kind == "attributes" and set(columns.values()) == {"geom"}
+    for layer, kinds in (("lines", {"divider", "boundary", "stop_line"}), ("crossings", {"crossing"})):
+        root = ET.fromstring(styles[layer])
+        assert {c.get("value") for c in root.iter("category")} == kinds
+        assert {c.get("symbol") for c in root.iter("category")} == {s.get("name") for s in root.iter("symbol")}
+
+
+def test_exported_times_are_iso_texts_in_utc(two_lanes, tmp_path):
+    seen = np.array([0, 1_772_352_000_123_456_789, 10, 20, 30])
+    m = replace(two_lanes(), t_first=seen)
+    export_map(m, tmp_path / "m.geojson")
+    features = json.loads((tmp_path / "m.geojson").read_text())["features"]
+    assert [f["properties"]["t_first"] for f in features][:2] == [
+        "1970-01-01T00:00:00.000Z",
+        "2026-03-01T08:00:00.123Z",
+    ]
+
+
+def test_coordinate_systems_that_do_not_fit_are_named(two_lanes, tmp_path):
+    pytest.importorskip("pyproj", reason="the map extra is not installed")
+    with pytest.raises(ConfigError, match=r"'EPSG:99'.*EPSG:25832"):
+        export_map(two_lanes(), tmp_path / "m.gpkg", crs="EPSG:99")
+    with pytest.raises(ConfigError, match="only a GeoPackage"):
+        export_map(two_lanes(), tmp_path / "m.osm", crs="EPSG:25832")
+    assert not list(tmp_path.iterdir())
 
 
 def test_geojson_rings_close_and_run_counter_clockwise(two_lanes, tmp_path):

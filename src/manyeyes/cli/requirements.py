@@ -120,6 +120,7 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
         _SHAPELY.when("file", "*.parquet"),
         _GEOPACKAGE.when("format", "geopackage", "pmtiles"),
         _GEOPACKAGE.when("file", "*.gpkg", "*.pmtiles"),
+        Requirement("map", ("pyproj",)).when("crs", "*:*"),
     ),
     "map view": (_ARROW, _SHAPELY, _MATPLOTLIB.when("out", "*.png")),
     "live run": (

@@ -21,6 +21,8 @@ class Options:
     """The file; .geojson, .gpkg, .parquet, .osm, .pmtiles and .npz name their format, .json needs --format."""
     format: str | None = None
     """geojson, geopackage, geoparquet, lanelet2, argoverse2, nuscenes, pmtiles or graph, where the ending does not say it."""
+    crs: str | None = None
+    """Coordinate system of a GeoPackage: EPSG:4326 by default, such as EPSG:25832, or local, metres about the map's origin."""
     simplify_m: LengthM = 0.05
     """Lines may leave their stations by so much, metres; 0 writes every station."""
     include_unpublished: bool = False
@@ -37,5 +39,5 @@ def main(options: Options) -> None:
     vector_map = read_vector_map(options.folder)
     selected = vector_map if options.include_unpublished else vector_map.select_published()
     options.file.parent.mkdir(parents=True, exist_ok=True)
-    export_map(selected, options.file, options.format, options.simplify_m)
+    export_map(selected, options.file, options.format, options.simplify_m, options.crs)
     Console().print(f"{options.file}: {len(selected)} elements", highlight=False, soft_wrap=True)

@@ -21,7 +21,8 @@ Ints = NDArray[np.int64]
 class Attributes:
     """N rows: id (hexadecimal), kind, state, style (the likeliest), numbers as in VectorMap, sigma_m the mean of its points.
 
-    confidence: the probability that belongs to the log-odds; score: what ranks the element in an evaluation.
+    confidence: the probability that belongs to the log-odds; score: what ranks the element in an evaluation. t_first, t_last:
+    ISO 8601 in UTC, to the millisecond.
     """
 
     id: NDArray[np.str_]
@@ -34,8 +35,8 @@ class Attributes:
     agents: Ints
     sigma_m: Floats
     length_m: Floats
-    t_first: Ints
-    t_last: Ints
+    t_first: NDArray[np.str_]
+    t_last: NDArray[np.str_]
 
     @classmethod
     def of(cls, vector_map: VectorMap) -> Attributes:
@@ -53,14 +54,20 @@ class Attributes:
             agents=vector_map.agents,
             sigma_m=np.round(np.bincount(e.element_of_point, vector_map.point_evidence.sigma, len(e)) / count, 4),
             length_m=np.round(e.lengths(), 3),
-            t_first=vector_map.t_first,
-            t_last=vector_map.t_last,
+            t_first=to_iso_times(vector_map.t_first),
+            t_last=to_iso_times(vector_map.t_last),
         )
 
     def columns(self) -> Iterator[tuple[str, NDArray]]:
         """Name and values of each column, in the order of the class."""
         for f in fields(self):
             yield f.name, getattr(self, f.name)
+
+
+def to_iso_times(times_ns: Ints) -> NDArray[np.str_]:
+    """Return (N,) ISO 8601 texts of nanoseconds since 1970, UTC, such as 2026-03-01T08:00:00.000Z."""
+    text = np.datetime_as_string(times_ns.astype("datetime64[ns]"), unit="ms").astype(np.str_)
+    return np.char.add(text, "Z")
 
 
 def to_hex_ids(digests: NDArray[np.uint8]) -> list[str]:

@@ -34,12 +34,27 @@ _WRITERS: dict[str, tuple[str, Writer]] = {
 FORMATS: tuple[str, ...] = tuple(_WRITERS)
 
 
-def export_map(vector_map: VectorMap, path: Path | str, format: str | None = None, simplify_m: float = 0.0) -> None:
-    """Write a map to a file; without a format the file's ending decides. Lines leave theirs by at most simplify_m."""
+def export_map(
+    vector_map: VectorMap,
+    path: Path | str,
+    format: str | None = None,
+    simplify_m: float = 0.0,
+    crs: str | None = None,
+) -> None:
+    """Write a map to a file; without a format the file's ending decides. Lines leave theirs by at most simplify_m.
+
+    crs: coordinate system of a GeoPackage, see :func:`manyeyes.maps.formats.geopackage.write_geopackage`.
+    """
     path = Path(path)
+    writer = _writer(path, format)
     if simplify_m > 0:
         vector_map = simplify_map(vector_map, simplify_m)
-    _writer(path, format)(vector_map, path)
+    if crs is None:
+        writer(vector_map, path)
+    elif writer is write_geopackage:
+        write_geopackage(vector_map, path, crs)
+    else:
+        raise ConfigError(f"{path}: only a GeoPackage has a choice of coordinate systems; leave --crs out.")
 
 
 def _writer(path: Path, format: str | None) -> Writer:
