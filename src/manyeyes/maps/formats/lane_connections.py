@@ -64,11 +64,9 @@ def connect_lanes(graph: LaneGraph, vector_map: VectorMap, drives_on_right: bool
     graph.sections[:] = [replace(s, direction=directions.get(s.lane, 0)) for s in graph.sections]
     keys = {(piece.first, piece.last): number for number, piece in enumerate(graph.pieces)}
     for a, b, both_ways in _choose_connections(_find_free_ends(graph)):
-        left = _add_curve(graph, keys, a.left, b.right, (a.left_xy, a.heading, b.right_xy, -b.heading))
-        right = _add_curve(graph, keys, a.right, b.left, (a.right_xy, a.heading, b.left_xy, -b.heading))
-        graph.sections.append(
-            LaneSection(left[0], right[0], left[1], right[1], lane=-1, direction=0 if both_ways else 1)
-        )
+        left = _add_curve(graph, keys, (a.left, b.right, True), (a.left_xy, a.heading, b.right_xy, -b.heading))
+        right = _add_curve(graph, keys, (a.right, b.left, False), (a.right_xy, a.heading, b.left_xy, -b.heading))
+        graph.add_section(LaneSection(left[0], right[0], left[1], right[1], lane=-1, direction=0 if both_ways else 1))
     return [(row, section) for row, section, _ in stopped]
 
 
@@ -261,15 +259,18 @@ def _has_outer(ends: list[_LaneEnd], a: _LaneEnd, on_left: bool, outward: bool) 
 def _add_curve(
     graph: LaneGraph,
     known: dict[tuple[Key, Key], int],
-    first: Key,
-    last: Key,
+    side: tuple[Key, Key, bool],
     geometry: tuple[Floats, Floats, Floats, Floats],
 ) -> tuple[int, bool]:
-    """Return the number of a curve between two points, and whether it runs the other way; geometry: place and tangent of each."""
-    if (first, last) in known:
-        return known[first, last], False
-    if (last, first) in known:
-        return known[last, first], True
+    """Return the number of a curve between two points, and whether it runs the other way.
+
+    side: both points, and whether the curve is the left side of its connection. geometry: place and tangent of each point. A
+    curve is shared with what lies on its other hand.
+    """
+    first, last, is_left = side
+    for key, is_reversed in (((first, last), False), ((last, first), True)):
+        if key in known and not graph.is_taken(known[key], is_left, is_reversed):
+            return known[key], is_reversed
     start, start_heading, end, end_heading = geometry
     handle = _HANDLE * float(np.hypot(*(end - start)))
     t = np.linspace(0.0, 1.0, _CURVE_POINTS)[:, None]
@@ -277,4 +278,4 @@ def _add_curve(
     curve = (1 - t) ** 3 * start + 3 * (1 - t) ** 2 * t * one + 3 * (1 - t) * t**2 * two + t**3 * end
     known[first, last] = len(graph.pieces)
     graph.pieces.append(Piece(curve, first, last))
-    return known[first, last], False
+    return len(graph.pieces) - 1, False

@@ -56,6 +56,18 @@ class LaneGraph:
 
     pieces: list[Piece] = field(default_factory=list)
     sections: list[LaneSection] = field(default_factory=list)
+    _taken: set[tuple[int, bool]] = field(default_factory=set)
+
+    def is_taken(self, piece: int, is_left: bool, is_reversed: bool) -> bool:
+        """Return whether a section lies already on that hand of a piece, of which it would be the left or right side."""
+        return (piece, is_left != is_reversed) in self._taken
+
+    def add_section(self, section: LaneSection) -> None:
+        """Add a section, unless another lies on the same hand of one of its sides."""
+        hands = [(section.left, True, section.left_reversed), (section.right, False, section.right_reversed)]
+        if not any(self.is_taken(*hand) for hand in hands):
+            self._taken |= {(piece, is_left != is_reversed) for piece, is_left, is_reversed in hands}
+            self.sections.append(section)
 
     def side(self, section: LaneSection, left: bool) -> Floats:
         """Return one side (M, 2) of a section, along it."""
@@ -97,7 +109,8 @@ def build_lane_sections(vector_map: VectorMap) -> LaneGraph:
             numbers[row, k] = len(graph.pieces)
             graph.pieces.append(Piece(line.piece(k), (row, k), (row, k + 1), row))
     for lane, pair in enumerate(pairs):
-        graph.sections += _sections_of_pair(lines, pair, lane, numbers)
+        for section in _sections_of_pair(lines, pair, lane, numbers):
+            graph.add_section(section)
     _merge_facing_ends(graph)
     return graph
 
