@@ -67,8 +67,9 @@ class PointCloud:
     def __getitem__(self, index: Tensor | slice) -> PointCloud:
         if isinstance(index, Tensor) and index.dtype == torch.bool:
             if index.shape == self.intensity.shape and all(map(_is_plain, (self.xyz, self.intensity, self.time_s))):
-                columns = (field.contiguous().numpy() for field in (self.xyz, self.intensity, self.time_s))
-                return PointCloud(*map(torch.from_numpy, keep_points(*columns, index.contiguous().numpy())))
+                xyz, intensity, time_s = (t.contiguous().numpy() for t in (self.xyz, self.intensity, self.time_s))
+                kept = keep_points(xyz, intensity, time_s, index.contiguous().numpy())
+                return PointCloud(*map(torch.from_numpy, kept))
             index = index.nonzero()[:, 0]  # once instead of for each field
             return PointCloud(*(field.index_select(0, index) for field in (self.xyz, self.intensity, self.time_s)))
         return PointCloud(self.xyz[index], self.intensity[index], self.time_s[index])
