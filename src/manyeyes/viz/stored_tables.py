@@ -22,6 +22,7 @@ from manyeyes.evaluation.statistics.training_seeds import (
     compute_pooled_std,
     summarize_seeds,
 )
+from manyeyes.viz.stored_pose_tables import is_pose_lines, is_pose_rows, make_pose_lines, make_pose_rows
 from manyeyes.viz.stored_study_tables import (
     format_stored_interval,
     make_main_tables,
@@ -65,7 +66,9 @@ def load_result(path: Path) -> StoredResult:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{path}: no stored result with provenance ({error!r}); write it by its command.") from error
     fields = result if isinstance(result, dict) else {}
-    command = fields.get("command") or origin.get("command")
+    config = origin.get("config")
+    stated = config.get("command") if isinstance(config, dict) else None
+    command = fields.get("command") or stated or origin.get("command")
     seeds = origin.get("seeds") or [origin.get("seed")]
     split = _find_split(origin, fields)
     missing = [
@@ -104,7 +107,11 @@ def _find_split(origin: dict[str, Any], result: dict[str, Any]) -> str:
 
 def _has_no_recording(result: dict[str, Any]) -> bool:
     """Return whether a result is of a benchmark whose scenes are made by its seed."""
-    return "settings" in result and "contender" in (result.get("rows") or [{}])[0]
+    return (
+        is_pose_lines(result)
+        or is_pose_rows(result)
+        or ("settings" in result and "contender" in (result.get("rows") or [{}])[0])
+    )
 
 
 def make_tables(stored: StoredResult) -> tuple[StoredTable, ...]:
@@ -225,6 +232,8 @@ def _make_speed(result: dict[str, Any]) -> list[StoredTable]:
 _KINDS: tuple[tuple[Callable[[dict[str, Any]], bool], Callable[[dict[str, Any]], list[StoredTable]]], ...] = (
     (lambda result: result.get("study") == "sensors", _make_sensors),
     (lambda result: result.get("study") == "strata", _make_strata),
+    (is_pose_lines, make_pose_lines),
+    (is_pose_rows, make_pose_rows),
     (lambda result: "cases" in result, _make_cases),
     (lambda result: "stats" in result and "rows" in result, _make_evaluation),
     (lambda result: "cpu_minutes" in result and "rows" in result, _make_finetune),
