@@ -36,7 +36,7 @@ def load_source(name: str) -> FrameSource:
         raise ConfigError(f"Source {name}: module {module_name} cannot be imported: {error}.") from error
     finally:
         sys.path.remove("")
-    function = getattr(module, function_name, None)
+    function: FrameSource | None = getattr(module, function_name, None)
     if not callable(function):
         raise ConfigError(f"Source {name}: module {module_name} has no function {function_name}.")
     return function
