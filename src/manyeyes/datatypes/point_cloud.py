@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from manyeyes.datatypes._point_kernels import keep_points, move_points, scale_points
+from manyeyes.datatypes._point_kernels import keep_points, scale_points
 from manyeyes.datatypes.errors import ShapeError
 from manyeyes.datatypes.numbers import Numbers, as_tensor
-from manyeyes.datatypes.transform import Transform
+from manyeyes.datatypes.transform import Transform, is_plain
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class PointCloud:
 
     def __getitem__(self, index: Tensor | slice) -> PointCloud:
         if isinstance(index, Tensor) and index.dtype == torch.bool:
-            if index.shape == self.intensity.shape and all(map(_is_plain, (self.xyz, self.intensity, self.time_s))):
+            if index.shape == self.intensity.shape and all(map(is_plain, (self.xyz, self.intensity, self.time_s))):
                 xyz, intensity, time_s = (t.contiguous().numpy() for t in (self.xyz, self.intensity, self.time_s))
                 kept = keep_points(xyz, intensity, time_s, index.contiguous().numpy())
                 return PointCloud(*map(torch.from_numpy, kept))
@@ -76,17 +76,11 @@ class PointCloud:
 
     def transform(self, target_from_source: Transform) -> PointCloud:
         """Return the same returns in another frame."""
-        xyz, rotation = self.xyz, target_from_source.rotation
-        if rotation.dim() == 2 and _is_plain(xyz):
-            turn, shift = rotation.float().contiguous(), target_from_source.translation.float()
-            moved = torch.from_numpy(move_points(xyz.contiguous().numpy(), turn.numpy(), shift.numpy()))
-        else:
-            moved = target_from_source.apply(xyz)
-        return PointCloud(moved, self.intensity, self.time_s)
+        return PointCloud(target_from_source.apply(self.xyz), self.intensity, self.time_s)
 
     def scale(self, factors: tuple[float, float, float]) -> PointCloud:
         """Return the same returns with x, y and z multiplied by factors."""
-        if _is_plain(self.xyz):
+        if is_plain(self.xyz):
             scaled = torch.from_numpy(scale_points(self.xyz.contiguous().numpy(), *factors))
         else:
             scaled = self.xyz * self.xyz.new_tensor(factors)
@@ -100,8 +94,3 @@ class PointCloud:
             torch.cat([c.intensity for c in clouds]),
             torch.cat([c.time_s for c in clouds]),
         )
-
-
-def _is_plain(x: Tensor) -> bool:
-    """Return whether compiled loops can read a tensor, and no gradient is lost by it."""
-    return x.device.type == "cpu" and x.dtype == torch.float32 and not x.requires_grad

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from manyeyes.datatypes._point_kernels import move_points
 from manyeyes.datatypes.errors import ShapeError
 from manyeyes.datatypes.numbers import Numbers, as_tensor
 
@@ -116,6 +117,10 @@ class Transform:
         if points.shape[-1:] != (3,):
             raise ShapeError(f"Transform.apply needs points (..., N, 3); got {tuple(points.shape)}.")
         rotation, translation = self.rotation.to(points), self.translation.to(points)
+        if points.dim() == rotation.dim() == 2 and is_plain(points) and is_plain(rotation) and is_plain(translation):
+            # One sum on every processor, at any number of points; products of matrices round as their kernel does.
+            rows = (points.contiguous(), rotation.contiguous(), translation.contiguous())
+            return torch.from_numpy(move_points(*(row.numpy() for row in rows)))
         return points @ rotation.mT + translation[..., None, :]
 
     def __getitem__(self, index: int | slice | Tensor) -> Transform:
@@ -139,3 +144,8 @@ def _rotate(rpy: Tensor) -> Tensor:
         (-sp, cp * sr, cp * cr),
     )
     return torch.tensor(rows, dtype=torch.float64)
+
+
+def is_plain(values: Tensor) -> bool:
+    """Return whether compiled code may read the values: float32 on the CPU, no gradient, no subclass."""
+    return type(values) is Tensor and values.dtype == torch.float32 and values.is_cpu and not values.requires_grad
