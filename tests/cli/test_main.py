@@ -123,7 +123,8 @@ def test_doctor_names_the_pip_line_of_a_missing_extra_and_the_commands_that_need
         monkeypatch.setattr(module, "is_installed", lambda name: name != "pyogrio")
     assert cli.main(["doctor"]) == 0
     output = " ".join(capsys.readouterr().out.split())
-    assert "missing pyogrio: pip install 'manyeyes[map]'; needed by map export (format geopackage, pmtiles)" in output
+    needed_by = "map import (sources *.gpkg, *.geojson), map export (format geopackage, pmtiles)"
+    assert f"missing pyogrio: pip install 'manyeyes[map]'; needed by {needed_by}" in output
     assert "needed by demo" not in output
 
 
@@ -143,6 +144,7 @@ def test_doctor_names_damaged_weights_and_exits_with_1(monkeypatch, capsys, tmp_
     output = capsys.readouterr()
     statuses = {status["name"]: status for status in json.loads(output.out)["weights"]}
     expected = {
+        "costr-base",
         "costr-small",
         "feakm-small",
         "map-small-camera",
