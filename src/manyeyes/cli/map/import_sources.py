@@ -43,8 +43,8 @@ class Options:
     """What is read, and what the file does not say."""
 
     sources: tyro.conf.Positional[tuple[Path, ...]]
-    """Sources: one map or more, of one region: an Argoverse 2 log or its map (.json), Lanelet2 (.osm), GeoPackage (.gpkg), GeoJSON, or a
-    folder of 'map fuse'. Or one result file: nuscmap_results.json of MapTR, submission_vector.json of StreamMapNet."""
+    """Sources: one map or more, of one region: an Argoverse 2 log or its map (.json), Lanelet2 (.osm), GeoPackage (.gpkg), GeoJSON,
+    or a folder of 'map fuse'. Or one result file: nuscmap_results.json of MapTR, submission_vector.json of StreamMapNet."""
     poses: Path | None = None
     """A CSV with token, agent, pass_id, time_ns, x, y, yaw and, if known, sigma_x, sigma_y, sigma_yaw."""
     origin: tuple[LatitudeDeg, LongitudeDeg] | None = None
