@@ -114,4 +114,4 @@ def test_whole_clouds_are_compared_by_name(drive, monkeypatch) -> None:
 def test_an_unknown_corrector_lists_the_known(drive, capsys) -> None:
     data, weights, out = drive
     assert run("pose", data, "--split", "test", "--weights", weights, "--out", out, "--correctors", "magic") == 1
-    assert "known: coalign, feaco, feakm, fpv-rcnn" in capsys.readouterr().err
+    assert "known: clipper, coalign, feaco, feakm, fpv-rcnn" in capsys.readouterr().err

@@ -39,4 +39,7 @@ def test_an_own_detector_is_evaluated_by_name(drive: Path, install, manyeyes, tm
     assert refused.returncode == 1 and "ClusterDetector is a BoxDetector: it has no tokens" in refused.stderr
 
     unknown = manyeyes(None, *words, "--methods", "no-fusion")
-    assert unknown.returncode == 1 and "No weights are named 'clusters'; known are costr-small" in unknown.stderr
+    assert (
+        unknown.returncode == 1
+        and "No weights are named 'clusters'; known are costr-base, costr-small" in unknown.stderr
+    )

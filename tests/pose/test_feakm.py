@@ -251,7 +251,7 @@ def test_names_select_weights_and_number_of_pairs(tmp_path):
         assert loaded.solver(ego, moved_back(TRUTH, ego), same(6), None).status.has_estimate == (min_pairs == 4)
     for name, why in (
         (f"{path}@x", "4 or 8"),
-        ("magic", "known: coalign"),
+        ("magic", "known: clipper, coalign"),
         (str(tmp_path / "no.safetensors"), "no such file"),
     ):
         with pytest.raises(ManyeyesError, match=why):

@@ -98,7 +98,7 @@ def test_wrong_shapes_name_the_columns() -> None:
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("magic", "known: coalign, feaco, feakm, fpv-rcnn"),
+        ("magic", "known: clipper, coalign, feaco, feakm, fpv-rcnn"),
         ("voting@8", "corrector with weights"),
         ("feakm@x", "4 or 8"),
         ("gicp", "compares whole clouds.*vips, voting"),

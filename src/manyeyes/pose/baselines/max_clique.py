@@ -50,8 +50,9 @@ def correct(
 def find_max_clique(graph: csr_matrix, max_branches: int) -> Ints:
     """Return the sorted nodes of a largest clique of a symmetric graph (P, P), whose stored entries are edges."""
     count = len(graph.indptr) - 1
-    # Nodes of many neighbours first: their colours are the smallest, so that the last branches are cut off early.
-    order = np.lexsort((np.arange(count), -np.diff(graph.indptr)))
+    # Nodes of many neighbours first: their colours are the smallest, so that the last branches are cut off early. Of equally many
+    # those of small entries, so that which clique is found first does not depend on the order of the nodes.
+    order = np.lexsort((np.arange(count), np.asarray(graph.sum(axis=1)).ravel(), -np.diff(graph.indptr)))
     place = np.argsort(order)
     neighbours = [sum(1 << int(place[k]) for k in graph.indices[graph.indptr[n] : graph.indptr[n + 1]]) for n in order]
     search = _CliqueSearch(neighbours, max_branches)
