@@ -35,11 +35,13 @@ SPEC = ScenarioSpec(
     density=6.0,
     environment="urban-2026",
 )
-# Of the first validation scene of carla-towns-small, frame 12, as simulated before there were environments.
-GOLDEN = "ac83314c390f0089530050a0d586800b"
+# Of the first validation scene of carla-towns-small, frame 12, as simulated before there were environments; but for the last bit of
+# the yaw of five boxes of 180, which depended on the processor (math.atan2 now, np.arctan2 then).
+GOLDEN = "9685a345f2774d8902b0830206ff6d33"
 
-# Of SPEC, frame 1: the world of a name stays what it was when recordings were made in it.
-URBAN_2026 = "771ee0f46248ef49995d08469152fdcd"
+# Of SPEC, frame 1: the world of a name stays what it was when recordings were made in it; but for the last bit of three of a
+# hundred intensities and of the yaw of seven boxes of 123, which depended on the processor.
+URBAN_2026 = "f1b9776590b53d50010c43c6f4dc6360"
 
 
 def digest(snapshot: Snapshot) -> str:

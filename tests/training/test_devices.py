@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from manyeyes.models.detector.layers import ActiveNorm
 from manyeyes.training.detector.task import DetectorTask, DetectorTrainConfig
 from manyeyes.training.presets import TRAINING_PRESETS
 from manyeyes.training.trainer import Trainer
@@ -58,6 +59,22 @@ def divergence(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor], beg
     return math.sqrt(apart / way)
 
 
+def sides_of_relus(monkeypatch, compute):
+    """The result of compute() and which outputs of normalised ReLUs are positive in it, (N,) bool on the CPU."""
+    sides = []
+    plain = ActiveNorm.forward_relu
+
+    def record(norm, input, skip=None):
+        out = plain(norm, input, skip)
+        sides.append((out.detach() > 0).cpu().flatten())
+        return out
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ActiveNorm, "forward_relu", record)
+        result = compute()
+    return result, torch.cat(sides)
+
+
 @pytest.mark.parametrize(
     "preset",
     [
@@ -66,28 +83,45 @@ def divergence(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor], beg
         pytest.param("costr-opv2v", marks=pytest.mark.slow),
     ],
 )
-def test_a_step_has_the_loss_and_the_gradients_of_the_cpu(toy, tmp_path, device, preset):
+def test_a_step_has_the_loss_and_the_gradients_of_the_cpu(toy, tmp_path, device, preset, monkeypatch):
+    """Every tensor of gradients within 1e-4 of its largest, in the first batch of five without a turned ReLU.
+
+    The gradient of a ReLU jumps where its input is zero. Where an input is smaller than its rounding, which is one of a million
+    and depends on the processor, the two devices may stand on two sides of the jump, and no bound holds for that element. Such
+    batches are passed over, and may have at most ten turned units of a million.
+    """
     batch = 1 if preset == "costr-opv2v" else 2
     ours, theirs = (
         Trainer(make_task(toy, preset, steps=4, batch=batch), tmp_path / str(i), d)
         for i, d in enumerate(("cpu", device))
     )
-    samples = [ours.task.draw(number) for number in range(batch)]
-    grads = []
-    for trainer in (ours, theirs):
-        loss, terms = trainer.task.loss(trainer.model, samples, range(batch), 0)
-        loss.backward()
-        assert loss.device == trainer.device and set(terms) == set(
-            ours.task.loss(ours.model, samples, range(batch), 0)[1]
-        )
-        grads.append({n: p.grad.cpu() for n, p in trainer.model.named_parameters() if p.grad is not None})
-        grads[-1]["loss"] = loss.detach().cpu()
-    assert float(grads[0]["loss"]) == pytest.approx(float(grads[1]["loss"]), rel=1e-5)
-    assert len(grads[0]) > 50 and largest_difference(*grads) < 1e-4
+    first, turned, grads = float("nan"), -1, []
+    for attempt in range(5):
+        samples = [ours.task.draw(number) for number in range(attempt * batch, (attempt + 1) * batch)]
+        grads, sides = [], []
+        for trainer in (ours, theirs):
+            (loss, terms), relus = sides_of_relus(
+                monkeypatch, lambda t=trainer, s=samples: t.task.loss(t.model, s, range(batch), 0)
+            )
+            loss.backward()
+            assert loss.device == trainer.device and set(terms) == set(
+                ours.task.loss(ours.model, samples, range(batch), 0)[1]
+            )
+            grads.append({n: p.grad.cpu() for n, p in trainer.model.named_parameters() if p.grad is not None})
+            grads[-1]["loss"] = loss.detach().cpu()
+            trainer.model.zero_grad(set_to_none=True)
+            sides.append(relus)
+        first = float(grads[0]["loss"]) if attempt == 0 else first
+        assert float(grads[0]["loss"]) == pytest.approx(float(grads[1]["loss"]), rel=1e-5) and len(grads[0]) > 50
+        turned = int((sides[0] != sides[1]).sum())
+        assert len(sides[0]) > 10_000 and turned <= 1e-5 * len(sides[0])
+        if turned == 0:
+            break
+    assert turned == 0 and largest_difference(*grads) < 1e-4
     before = weights_of(theirs)
     assert all(p.device == device for p in theirs.model.parameters())
     progress = theirs.advance()
-    assert progress.loss == pytest.approx(float(grads[0]["loss"]), rel=1e-5)
+    assert progress.loss == pytest.approx(first, rel=1e-5)
     assert largest_difference(before, weights_of(theirs)) > 1e-3
 
 

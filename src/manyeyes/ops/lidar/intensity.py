@@ -85,11 +85,13 @@ def compute_intensity(
     Returns:
         (N,) float32 in [0, 1].
     """
-    material = reflectivity * torch.exp(-ATTENUATION_PER_M * range_m)
+    # In float64: libraries round exponentials and powers of float32 by processor, and recordings are the same bytes on all of them.
+    attenuation = torch.exp(-ATTENUATION_PER_M * range_m.double())
+    material = reflectivity * attenuation
     if law.kind == "material":
         stored = material
     elif law.kind == "carla":
-        stored = torch.exp(-ATTENUATION_PER_M * range_m)
+        stored = attenuation
     elif law.kind in ("constant", "zero"):
         stored = torch.full_like(material, law.floor if law.kind == "constant" else 0.0)
     elif law.kind == "low-gain-8bit":
@@ -131,6 +133,6 @@ def change_intensity_law(
     x, y, z = points.xyz.unbind(1)
     ground_range = torch.hypot(x, y)
     range_m = torch.hypot(ground_range, z - sensor_height_m)
-    reflectivity = points.intensity * torch.exp(ATTENUATION_PER_M * range_m)
+    reflectivity = points.intensity * torch.exp(ATTENUATION_PER_M * range_m.double())
     elevation = torch.atan2(z - sensor_height_m, ground_range)
     return PointCloud(points.xyz, compute_intensity(law, reflectivity, range_m, elevation, key), points.time_s)

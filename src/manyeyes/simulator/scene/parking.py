@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from manyeyes.maps.roads.road_network import DRIVABLE, Lane, RoadNetwork
 from manyeyes.ops.keyed_random import keyed_generator
+from manyeyes.simulator.scene.directions import direction
 from manyeyes.simulator.scene.vehicle_market import CLASSIC_MARKET, VehicleMarket, draw_vehicles
 from manyeyes.simulator.scene.vehicles import VehicleStates, overlaps
 
@@ -78,7 +79,7 @@ def _cars_along_lane(
     slope = np.stack(
         [np.interp(s + 1.0, station, border[:, k]) - np.interp(s - 1.0, station, border[:, k]) for k in range(3)], -1
     )
-    yaw = np.arctan2(slope[:, 1], slope[:, 0])
+    yaw = direction(slope[:, 1], slope[:, 0])
     right = np.stack((np.sin(yaw), -np.cos(yaw)), -1)
     offset = size[:, 1] / 2 + _KERB_GAP_M
     beside = network.lanes[lane.right_neighbor] if lane.right_neighbor >= 0 else None
@@ -87,7 +88,7 @@ def _cars_along_lane(
         offset = np.maximum(offset, np.where(width > size[:, 1], width / 2, 0.0))
     at[:, :2] += right * offset[:, None]
     rise = np.hypot(slope[:, 0], slope[:, 1])
-    pitch = -np.arctan2(slope[:, 2], np.maximum(rise, 1e-6))
+    pitch = -direction(slope[:, 2], np.maximum(rise, 1e-6))
     backwards = turned < 0.1
     yaw = yaw + twist + np.where(backwards, np.pi, 0.0)
     pitch = np.where(backwards, -pitch, pitch)
@@ -108,7 +109,7 @@ def _in_spaces(network: RoadNetwork, seed: int, density: float, market: VehicleM
     one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1]
     longer = np.linalg.norm(one, axis=1) > np.linalg.norm(two, axis=1)
     ahead = np.where(longer[:, None], one, two)
-    yaw = np.arctan2(ahead[:, 1], ahead[:, 0]) + np.where(random.random(n) < 0.5, np.pi, 0.0)
+    yaw = direction(ahead[:, 1], ahead[:, 0]) + np.where(random.random(n) < 0.5, np.pi, 0.0)
     states = _states(900_000_000 + np.arange(n), kind, corners.mean(1), yaw, np.zeros(n), size)
     return states[taken]
 

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from manyeyes.maps.roads.road_network import PAVED, WALKABLE, Lane, RoadNetwork
 from manyeyes.maps.roads.surface import RoadSurface
+from manyeyes.simulator.scene.directions import direction
 from manyeyes.simulator.scene.ground import is_multilevel
 
 Array = NDArray[np.float64]
@@ -119,7 +120,7 @@ def roadside_points(
     eps = 0.05
     dx = surface.distance(xy + [eps, 0.0]) - surface.distance(xy - [eps, 0.0])
     dy = surface.distance(xy + [0.0, eps]) - surface.distance(xy - [0.0, eps])
-    return RoadsidePoints(xy, np.arctan2(-dy, -dx), distance)
+    return RoadsidePoints(xy, direction(-dy, -dx), distance)
 
 
 def _nearby_surface(network: RoadNetwork, kinds: tuple[str, ...], center: Array, radius_m: float) -> RoadSurface:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from manyeyes.datatypes import ConfigError
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.raycast import HeightField
+from manyeyes.simulator.scene.directions import direction
 from manyeyes.simulator.scene.placement import PlacementGrid, distance_transform
 from manyeyes.simulator.scene.vehicles import VehicleStates
 
@@ -137,7 +138,7 @@ def stand_on_ground(states: VehicleStates, field: HeightField) -> VehicleStates:
     wheel = height_at(field, wheel_points(states))
     ahead = (wheel[:, 0] + wheel[:, 1] - wheel[:, 2] - wheel[:, 3]) / 2
     left = (wheel[:, 0] + wheel[:, 3] - wheel[:, 1] - wheel[:, 2]) / 2
-    pitch = -np.arctan2(ahead, 2 * _AXLE * states.size[:, 0])
-    roll = np.arctan2(left, 2 * _TRACK * states.size[:, 1])
+    pitch = -direction(ahead, 2 * _AXLE * states.size[:, 0])
+    roll = direction(left, 2 * _TRACK * states.size[:, 1])
     position = np.concatenate((states.position[:, :2], wheel.mean(1, keepdims=True)), 1)
     return replace(states, position=position, pitch=pitch, roll=roll)

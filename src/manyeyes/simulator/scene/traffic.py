@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from manyeyes.datatypes import LABELS, ConfigError, MissingExtraError
 from manyeyes.maps.roads.road_network import RoadNetwork
 from manyeyes.ops.keyed_random import keyed_generator
+from manyeyes.simulator.scene.directions import direction
 from manyeyes.simulator.scene.parking import parked_cars
 from manyeyes.simulator.scene.towns import run_sumo_tool
 from manyeyes.simulator.scene.vehicle_market import CLASSIC_MARKET, VehicleMarket, draw_vehicles
@@ -286,7 +287,7 @@ def _headings(vehicle: NDArray[np.int64], state: Array, length: Array) -> Array:
         way = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(track, axis=0), axis=1))))
         rear = np.stack([np.interp(way[1:] - reach, way, track[:, k]) for k in (0, 1)], -1)
         delta = front - rear
-        heading[rows] = np.arctan2(delta[:, 1], delta[:, 0])
+        heading[rows] = direction(delta[:, 1], delta[:, 0])
     return heading
 
 
@@ -338,7 +339,7 @@ def _to_states(
     front = surface.height(middle + ahead * base, state[:, 2])
     rear = surface.height(middle - ahead * base, state[:, 2])
     position = np.concatenate((middle, (front + rear)[:, None] / 2), -1)
-    pitch = -np.arctan2(front - rear, 2 * base[:, 0])
+    pitch = -direction(front - rear, 2 * base[:, 0])
     return VehicleStates(vehicle, kind, position, yaw, pitch, state[:, 4], size)
 
 
