@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train all fusions that are compared, run after run, so that what is finished at any time is whole rows of the tables.
 
-python scripts/fusion_runs.py --data FOLDER --out runs/fusions [--seeds 5 6 7] [--stage-c fast v2vnet] [--hours 8] [--list]
+python scripts/fusion_runs.py --data FOLDER --out runs/fusions [--seeds 5 6 7] [--stage-c fast v2vnet] [--hours 8] [--jobs 2]
 
 Order: the base (stage-a); every fusion inside with the first seed; six bare ones; the other seeds, fusion by fusion; the rows of
 CoSTr's Table III that are no run of before, each after its base; the other bare ones; stage C, 10,000 steps from nothing. A run has
@@ -18,6 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -83,9 +84,16 @@ def make_command(run: Run, base_seed: int, data: Sequence[Path], out: Path, opti
 
 
 def carry_out(
-    runs: Sequence[Run], command_of: Callable[[Run], Sequence[str]], out: Path, end_s: float = float("inf")
+    runs: Sequence[Run],
+    command_of: Callable[[Run], Sequence[str]],
+    out: Path,
+    end_s: float = float("inf"),
+    jobs: int = 1,
 ) -> list[State]:
-    """Train what is not finished, and write runs.json after every run; none begins after end_s of ``time.monotonic``."""
+    """Train what is not finished, jobs runs at a time, and write runs.json after every run.
+
+    A run waits for its base; none begins after end_s of ``time.monotonic``.
+    """
     states = {run: State(run.preset, run.seed, "finished" if _is_finished(run, out) else "left") for run in runs}
     if (out / "runs.json").exists():
         for entry in json.loads((out / "runs.json").read_text()):
@@ -93,25 +101,34 @@ def carry_out(
             known = next((r for r in runs if (r.preset, r.seed) == (before.preset, before.seed)), None)
             if known is not None and before.state == states[known].state == "finished":
                 states[known] = before
-    for run in runs:
-        base = None if run.base is None else Run(run.base, runs[0].seed)
-        if (
-            states[run].state == "finished"
-            or time.monotonic() >= end_s
-            or not (base is None or _is_finished(base, out))
-        ):
-            continue
-        folder, begin = out / run.folder, time.monotonic()
-        folder.mkdir(parents=True, exist_ok=True)
-        with (folder / "output.txt").open("a") as log:
-            failed = subprocess.run(command_of(run), stdout=log, stderr=subprocess.STDOUT).returncode
-        finished = not failed and _is_finished(run, out)
-        seconds = round(time.monotonic() - begin, 1)
-        states[run] = State(run.preset, run.seed, "finished" if finished else "failed", seconds)
-        print(f"{states[run].state}: {run.preset}, seed {run.seed}, {seconds:.0f} s", flush=True)
-        _write(list(states.values()), out)
+    waiting = [run for run in runs if states[run].state != "finished"]
+    with ThreadPoolExecutor(jobs) as pool:
+        running: dict[Future[State], Run] = {}
+        while waiting or running:
+            bases = [None if run.base is None else Run(run.base, runs[0].seed) for run in waiting]
+            ready = [run for run, base in zip(waiting, bases) if base is None or _is_finished(base, out)]
+            for run in ready[: jobs - len(running)] if time.monotonic() < end_s else ():
+                waiting.remove(run)
+                running[pool.submit(_train, run, command_of(run), out)] = run
+            if not running:
+                break
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                run, state = running.pop(future), future.result()
+                states[run] = state
+                print(f"{state.state}: {run.preset}, seed {run.seed}, {state.seconds:.0f} s", flush=True)
+            _write(list(states.values()), out)
     _write(list(states.values()), out)
     return list(states.values())
+
+
+def _train(run: Run, command: Sequence[str], out: Path) -> State:
+    """Train one run in a process of its own, whose output is appended to output.txt of its folder."""
+    folder, begin = out / run.folder, time.monotonic()
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / "output.txt").open("a") as log:
+        failed = subprocess.run(command, stdout=log, stderr=subprocess.STDOUT).returncode
+    finished = not failed and _is_finished(run, out)
+    return State(run.preset, run.seed, "finished" if finished else "failed", round(time.monotonic() - begin, 1))
 
 
 def _is_finished(run: Run, out: Path) -> bool:
@@ -130,9 +147,12 @@ def main() -> int:
     parser.add_argument("--seeds", type=int, nargs="+", default=[5, 6, 7])
     parser.add_argument("--stage-c", nargs="*", choices=STAGE_C_FUSIONS, default=[], help="fast, and the best baseline")
     parser.add_argument("--hours", type=float, default=float("inf"), help="after this time no run begins")
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time, each on one thread")
     parser.add_argument("--list", action="store_true", help="print the runs in their order, and train nothing")
     parser.add_argument("--options", nargs=argparse.REMAINDER, default=[], help="of manyeyes train, for every run")
     chosen = parser.parse_args()
+    if chosen.jobs < 1:
+        parser.error("--jobs: at least 1")
     runs = make_runs(chosen.seeds, chosen.stage_c)
     if chosen.list:
         for run in runs:
@@ -144,7 +164,7 @@ def main() -> int:
     def command_of(run: Run) -> list[str]:
         return make_command(run, chosen.seeds[0], chosen.data, chosen.out, chosen.options)
 
-    states = carry_out(runs, command_of, chosen.out, end_s)
+    states = carry_out(runs, command_of, chosen.out, end_s, chosen.jobs)
     left = [state for state in states if state.state != "finished"]
     for state in left:
         print(f"{state.state}: {state.preset}, seed {state.seed}")

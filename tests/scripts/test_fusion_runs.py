@@ -73,6 +73,23 @@ def test_runs_without_their_base_and_after_the_time_are_left(script, tmp_path: P
     assert [state.state for state in script.carry_out(runs, fake(tmp_path), tmp_path, end_s=0.0)] == ["left", "left"]
 
 
+def test_several_runs_at_a_time_wait_for_their_base(script, tmp_path: Path) -> None:
+    """Two runs wait for each other, which only ends where both run at the same time; neither begins before the base is finished."""
+    runs = [script.Run("fusion/max", 5), script.Run("fusion/fast", 5), script.Run("stage-a", 5, None)]
+
+    def command(run) -> list[str]:
+        own, base = tmp_path / run.folder, tmp_path / "stage-a/seed-5"
+        others = [tmp_path / r.folder for r in runs[:2]] if run.base else []
+        code = f"import pathlib, time; P = pathlib.Path; P({str(own)!r}, 'begun').touch(); "
+        code += f"assert {run.base is None} or P({str(base)!r}, 'weights.safetensors').exists(); "
+        code += f"t = time.time()\nwhile not all(P(o, 'begun').exists() for o in {list(map(str, others))}):\n"
+        code += " time.sleep(.01)\n assert time.time() < t + 30\n"
+        return [sys.executable, "-S", "-c", code + f"P({str(own)!r}, 'weights.safetensors').touch()"]
+
+    states = script.carry_out(runs, command, tmp_path, jobs=2)
+    assert [state.state for state in states] == ["finished"] * 3
+
+
 def test_the_command_starts_from_the_base_of_the_first_seed(script, tmp_path: Path) -> None:
     command = script.make_command(script.Run("fusion/max", 6), 5, [Path("a"), Path("b")], tmp_path, ["--batch", "2"])
     text = " ".join(command[3:])
