@@ -48,7 +48,7 @@ class FoldedConvs:
     def __call__(self, x: Tensor, table: NeighbourMap) -> Tensor:
         """Apply all layers, (N, C) to (M, D); more than one need a table that leads from a set of sites to itself."""
         rows, weight, bias = (t.numpy() for t in (x.contiguous(), self.weight, self.bias))
-        return torch.from_numpy(_layers(rows, weight, bias, table.pairs, table.is_symmetric, table.n_out))
+        return torch.from_numpy(apply_layers(rows, weight, bias, table.pairs, table.is_symmetric, table.n_out))
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class FoldedUp:
         rows, beside = coarse.contiguous().numpy(), fine.contiguous().numpy()
         weight, lateral, bias = (t.numpy() for t in (self.weight, self.lateral, self.bias))
         turned = Pairs(table.pairs.target, table.pairs.source, table.pairs.counts)
-        return torch.from_numpy(_convolve_up(rows, weight, beside, lateral, bias, turned))
+        return torch.from_numpy(convolve_up(rows, weight, beside, lateral, bias, turned))
 
 
 class _RowNorm(NamedTuple):
@@ -123,9 +123,10 @@ def is_supported(x: Tensor) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _layers(
+def apply_layers(
     x: F32x2, weight: F32x5, bias: F32x2, pairs: Pairs, is_symmetric: bool, rows: int
 ) -> F32x2:  # pragma: no cover
+    """Return all layers of x (N, C), one after another: (rows, D); weight and bias as of ``FoldedConvs``."""
     out = empty_rows(rows, bias.shape[1])
     convolve(x, weight[0], bias[0], pairs, is_symmetric, True, out)
     spare = empty_rows(*out.shape)
@@ -136,9 +137,10 @@ def _layers(
 
 
 @njit(cache=True, nogil=True)
-def _convolve_up(
+def convolve_up(
     x: F32x2, weight: F32x4, fine: F32x2, lateral: F32x4, bias: F32x1, pairs: Pairs
 ) -> F32x2:  # pragma: no cover
+    """Return (N, D) on the rows of fine (N, L), from x (M, C); weights as of ``FoldedUp``."""
     n = fine.shape[0]
     out, rows = empty_rows(n, bias.shape[0]), np.arange(n)
     for i in range(n):

@@ -54,7 +54,7 @@ class Pairs(NamedTuple):
     counts: NDArray[np.int64]
 
 
-class _BorderedImages(NamedTuple):
+class BorderedImages(NamedTuple):
     """How many index images with a border that no tap leaves, and the rows and columns of each."""
 
     batch_size: int
@@ -137,11 +137,11 @@ class NeighbourMap:
     def pairs(self) -> Pairs:
         """Which inputs lead to which outputs, on the CPU."""
         if _in_loops(self.in_key):
-            bordered = _BorderedImages(
+            bordered = BorderedImages(
                 self.batch_size, *_compute_bordered_shape(self.out_shape, self.in_shape, self.window)
             )
             out_key, in_key = self.out_key.numpy(), self.in_key.numpy()
-            return _pairs(out_key, in_key, self.out_shape, self.in_shape, bordered, self.window, self._taps)
+            return collect_pairs(out_key, in_key, self.out_shape, self.in_shape, bordered, self.window, self._taps)
         return Pairs(*(part.numpy() for part in self._met))
 
     @cached_property
@@ -198,7 +198,7 @@ def split(key: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
 def distinct(key: Tensor, size: int) -> tuple[Tensor, Tensor]:
     """Return ascending distinct keys (M,) of keys (N,) in [0, size), and the place (N,) int64 of each key among them."""
     if _in_loops(key):
-        found, row = _distinct(key.numpy(), np.zeros(size // 8 * 8 + 8, np.uint8))
+        found, row = collect_distinct(key.numpy(), np.zeros(size // 8 * 8 + 8, np.uint8))
         return torch.from_numpy(found), torch.from_numpy(row)
     image = torch.zeros(size, dtype=torch.int32, device=key.device)
     image[key] = 1
@@ -227,7 +227,7 @@ def parent_sites(key: Tensor, shape: tuple[int, int], batch_size: int, stride: i
     """Return keys of the cells ``floor(i / stride)`` of active cells i, on a grid of ceil(shape / stride)."""
     rows, columns = -(-shape[0] // stride), -(-shape[1] // stride)
     if _in_loops(key):
-        return torch.from_numpy(_parents(key.numpy(), *shape, batch_size, rows, columns, stride))
+        return torch.from_numpy(collect_parents(key.numpy(), *shape, batch_size, rows, columns, stride))
     batch, y, x = split(key, shape)
     y, x = y.div(stride, rounding_mode="floor"), x.div(stride, rounding_mode="floor")
     return distinct((batch * rows + y) * columns + x, batch_size * rows * columns)[0]
@@ -237,7 +237,7 @@ def finer_keys(key: Tensor, shape: tuple[int, int], finer: tuple[int, int], rati
     """Return ascending keys (N,) of the cells ``i * ratio`` on a finer grid, of cells i with ascending keys (N,)."""
     if _in_loops(key):
         out = torch.empty_like(key)
-        _finer(key.numpy(), *shape, *finer, ratio, out.numpy())
+        collect_finer(key.numpy(), *shape, *finer, ratio, out.numpy())
         return out
     batch, y, x = split(key, shape)
     return (batch * finer[0] + y * ratio) * finer[1] + x * ratio
@@ -313,7 +313,7 @@ def mark_ranks(marks: U8x1) -> tuple[I64x1, I32x1]:  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _distinct(key: I64x1, marks: U8x1) -> tuple[I64x1, I64x1]:  # pragma: no cover
+def collect_distinct(key: I64x1, marks: U8x1) -> tuple[I64x1, I64x1]:  # pragma: no cover
     """Return ascending distinct keys and the place of each key among them; marks: zeros for every key there may be."""
     for k in key:
         marks[k] = 1
@@ -325,9 +325,10 @@ def _distinct(key: I64x1, marks: U8x1) -> tuple[I64x1, I64x1]:  # pragma: no cov
 
 
 @njit(cache=True, nogil=True)
-def _parents(
+def collect_parents(
     key: I64x1, in_rows: int, in_columns: int, batch_size: int, rows: int, columns: int, stride: int
 ) -> I64x1:  # pragma: no cover
+    """As parent_sites, of ascending keys."""
     marks = np.zeros(batch_size * rows * columns // 8 * 8 + 8, np.uint8)
     start, end, first = 0, 0, 0
     for k in key:
@@ -340,7 +341,7 @@ def _parents(
 
 
 @njit(cache=True, nogil=True)
-def _finer(
+def collect_finer(
     key: I64x1, in_rows: int, in_columns: int, rows: int, columns: int, ratio: int, out: I64x1
 ) -> None:  # pragma: no cover
     """As finer_keys, of ascending keys."""
@@ -354,12 +355,12 @@ def _finer(
 
 
 @njit(cache=True, nogil=True)
-def _pairs(
+def collect_pairs(
     out_key: I64x1,
     in_key: I64x1,
     out_shape: tuple[int, int],
     in_shape: tuple[int, int],
-    bordered: _BorderedImages,
+    bordered: BorderedImages,
     window: Window,
     taps: int,
 ) -> Pairs:  # pragma: no cover

@@ -9,8 +9,10 @@ from torch import nn
 
 from manyeyes._bounds import ChannelCount, LayerCount
 from manyeyes.datatypes import ConfigError, SparseBev
+from manyeyes.models.detector.folded_encoder import FoldedEncoder
 from manyeyes.models.detector.layers import DownLayer, SubmanifoldLayer, SubmanifoldStage, UpLayer
 from manyeyes.models.detector.pruning import FocalPrune, PruneOutput
+from manyeyes.ops.folded_conv import is_supported
 from manyeyes.ops.sparse_conv import merge
 
 STRIDES: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
@@ -77,12 +79,15 @@ class SparseEncoder(nn.Module):
         ups = [s for s in (4, 2) if s >= config.head_stride]
         self.up = nn.ModuleDict({str(s): UpLayer(width[2 * s], width[s], width[s]) for s in ups})
         self.out_channels = config.token_channels or width[config.head_stride]
+        self.folded: FoldedEncoder | None = None
         self.project = (
             nn.Identity() if config.token_channels is None else nn.Linear(width[config.head_stride], self.out_channels)
         )
 
     def forward(self, x: SparseBev, prune_threshold: float) -> EncoderOutput:
         """Encode pillars; cells with a probability below prune_threshold are dropped, 0 drops none."""
+        if self.folded is not None and is_supported(x.features):
+            return EncoderOutput(*self.folded(x, prune_threshold))
         levels: dict[int, SparseBev] = {}
         pruned: list[PruneOutput] = []
         for stride, down, stage in zip(self.strides, self.down, self.stages):
@@ -96,3 +101,13 @@ class SparseEncoder(nn.Module):
             tokens = up(tokens, levels[int(stride)])
         tokens = tokens.with_features(self.project(tokens.features))
         return EncoderOutput(tokens, tuple(pruned), tuple(len(levels[s].sites) for s in self.strides))
+
+    def fold(self, in_bfloat16: bool = False) -> None:
+        """Join the layers, which are folded before, to one chain of compiled calls; it reads their weights."""
+        convs = [layer.folded for layer in (*self.down, self.post_merge)]
+        stages = [stage.folded for stage in self.stages]
+        is_known = all(stage.folded is not None for stage in self.stages if list(stage.children()))
+        if is_known and not self.config.dilating:
+            prunes = {s: self.prune[str(s)] for s in self.strides if str(s) in self.prune}
+            ups = {int(stride): up.folded for stride, up in self.up.items()}
+            self.folded = FoldedEncoder.of(self.strides, convs, stages, prunes, ups, self.project)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 
 from manyeyes.models.detector.detector import Detector
+from manyeyes.models.detector.encoder import SparseEncoder
 from manyeyes.models.detector.layers import DownLayer, SubmanifoldLayer, SubmanifoldStage, UpLayer
 from manyeyes.models.detector.transformer import WindowBlock
 from manyeyes.models.fusion.flow_aware import PastAttention
@@ -13,6 +14,7 @@ from manyeyes.models.fusion.positional_encoding import SpatioTemporalEncoding
 from manyeyes.models.fusion.token_merge import TokenMerge
 
 _FOLDED = (
+    SparseEncoder,
     SubmanifoldStage,
     SubmanifoldLayer,
     DownLayer,
@@ -34,7 +36,8 @@ def fold_norms(model: Detector, in_bfloat16: bool = False) -> Detector:
     decoded. The copy cannot be saved or trained.
     """
     copied = copy.deepcopy(model).eval().requires_grad_(False)
-    for layer in copied.modules():
+    # Parts before what they are part of.
+    for layer in reversed(list(copied.modules())):
         if isinstance(layer, _FOLDED):
             layer.fold(in_bfloat16)
     return copied
