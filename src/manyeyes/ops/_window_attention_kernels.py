@@ -18,6 +18,7 @@ from torch import Tensor
 
 from manyeyes._jit import F32x1, I64x1, Uintpx1, njit
 from manyeyes.datatypes import ShapeError
+from manyeyes.ops._window_order_kernels import sort_windows
 from manyeyes.ops._window_softmax_kernels import FAST, attend, power_of_two
 
 _TILE = 64
@@ -40,20 +41,8 @@ class WindowRuns:
 
 def window_runs(window: Tensor) -> WindowRuns:
     """Return tokens of windows (N,) int64, sorted."""
-    ids, order = window.sort(stable=True)
-    return WindowRuns(order, torch.from_numpy(_starts(ids.numpy())))
-
-
-@njit(cache=True, nogil=True)
-def _starts(ids: I64x1) -> I64x1:  # pragma: no cover
-    """Where each run of equal ids (N,) begins, and N."""
-    start, runs = np.empty(ids.shape[0] + 1, np.int64), 0
-    for i in range(ids.shape[0]):
-        if i == 0 or ids[i] != ids[i - 1]:
-            start[runs] = i
-            runs += 1
-    start[runs] = ids.shape[0]
-    return start[: runs + 1]
+    order, start = sort_windows(window.numpy())
+    return WindowRuns(torch.from_numpy(order), torch.from_numpy(start))
 
 
 def attend_in_windows(q: Tensor, k: Tensor, v: Tensor, runs: WindowRuns) -> Tensor:

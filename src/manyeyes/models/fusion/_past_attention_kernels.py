@@ -21,6 +21,7 @@ from manyeyes.ops._attention_block_kernels import (
     place_rows,
 )
 from manyeyes.ops._sparse_conv_kernels import empty_rows
+from manyeyes.ops._window_order_kernels import order_windows
 from manyeyes.ops._window_softmax_kernels import attend_across
 
 
@@ -91,7 +92,7 @@ def attend_past(
 ) -> F32x2:  # pragma: no cover
     """Return features (N, C) of the tokens, changed where their window holds past tokens."""
     out = tokens.features.copy()
-    order, past_order = np.argsort(tokens.window, kind="mergesort"), np.argsort(past.window, kind="mergesort")
+    order, past_order = order_windows(tokens.window), order_windows(past.window)
     chosen, start = _select_shared(tokens.window, order, past.window, past_order)
     known, past_start = _select_shared(past.window, past_order, tokens.window, order)
     n, m, channels = chosen.shape[0], known.shape[0], out.shape[1]
