@@ -179,3 +179,31 @@ def test_compiled_decoding_equals_decoding_by_tensors(size: int) -> None:
     got, want = codebook.decode(codes), codebook.decode_by_tensors(codes)
     assert torch.equal(got[:, 12:], want[:, 12:]) and torch.allclose(got[:, :12], want[:, :12], atol=1e-6)
     assert codebook.decode(codes[:0]).shape == (0, 12 + PROPOSAL_DIM)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_loops_of_a_folded_codebook_give_the_codes_of_the_tensors(seed: int) -> None:
+    torch.manual_seed(seed)
+    book = Codebook(24, CodebookConfig(stages=3, size=64))
+    book.centres.normal_()
+    # Values beyond the codes too, and equal class logits.
+    rows = proposals(seed) * torch.rand(200, 1) * 4
+    rows[:20, BOX_LAYOUT.class_logits] = 1.5
+    tokens = torch.cat((torch.randn(200, 24) * 2, rows), 1)
+    wanted = book.encode(tokens)
+    book.fold()
+    assert book.folded is not None
+    found = book.encode(tokens)
+    assert torch.equal(found[:, :3], wanted[:, :3])
+    assert torch.equal(found[20:, 3:], wanted[20:, 3:])
+    # Which of equal classes comes first is free; that neither leads is not.
+    assert torch.equal(book.decode(found)[:20, 24:].abs(), book.decode(wanted)[:20, 24:].abs())
+    assert book.encode(tokens[:0]).shape == (0, book.width)
+
+
+def test_the_first_of_equal_centres_is_taken() -> None:
+    book = Codebook(8, CodebookConfig(stages=1, size=16))
+    book.centres[0, [3, 7]] = 1.0
+    book.fold()
+    codes = book.encode(torch.cat((torch.ones(1, 8), proposals(0, 1)), 1))
+    assert int(codes[0, 0]) == 3

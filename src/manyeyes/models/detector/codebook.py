@@ -12,19 +12,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from manyeyes._bounds import ChannelCount, StageCount
 from manyeyes.datatypes import ConfigError, ShapeError
-from manyeyes.models.detector._code_kernels import decode_rows
+from manyeyes.models.detector._code_kernels import CentreTables, decode_rows, encode_features, encode_proposals
+from manyeyes.models.detector.box_head import BOX_LAYOUT, axis_yaw
 from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.detector.proposal_codes import (
+    AXIS_STEP,
     PROPOSAL_CODES,
     make_code_rules,
     proposal_from_codes,
     proposal_to_codes,
 )
+from manyeyes.ops._sparse_conv_kernels import LANES, panels
 
 FREQUENCY_TOTAL = 4096
 """Sum of the frequencies of one byte of a row, as required by ``comms.entropy``."""
@@ -58,12 +62,23 @@ class Codebook(nn.Module):
         self.register_buffer("centres", torch.zeros(config.stages, config.size, channels, device="cpu"))
         uniform = torch.full((self.width, 256), FREQUENCY_TOTAL // 256, dtype=torch.int16, device="cpu")
         self.register_buffer("frequencies", uniform)
+        self.folded: CentreTables | None = None
+
+    def fold(self, in_bfloat16: bool = False) -> None:
+        """Copy the centres permanently to tables of compiled loops, in float32; encode uses these afterwards."""
+        if self.centres.is_cuda or self.centres.shape[1] % LANES:
+            return
+        centres = self.centres.detach().float()
+        columns = np.stack([panels(stage.T[None]) for stage in centres])
+        self.folded = CentreTables(centres.numpy().copy(), centres.square().sum(2).numpy().copy(), columns)
 
     def encode(self, tokens: Tensor) -> Tensor:
         """Encode tokens (N, C + PROPOSAL_DIM) to codes (N, W) uint8."""
         features = tokens[:, :-PROPOSAL_DIM]
         if features.shape[1] != self.centres.shape[2]:
             raise ShapeError(f"This codebook is of {self.centres.shape[2]} features; got {features.shape[1]}.")
+        if self.folded is not None and _is_plain(tokens):
+            return _encode_in_loops(tokens, self.folded)
         quantised = residual_codes(features.to(self.centres.device), self.centres).to(tokens.device)
         return torch.cat((quantised, proposal_to_codes(tokens[:, -PROPOSAL_DIM:])), 1)
 
@@ -84,6 +99,26 @@ class Codebook(nn.Module):
         index = codes[:, :stages].long().clamp_max(size - 1).to(self.centres.device)
         features = self.centres[torch.arange(stages, device=index.device), index].sum(1).to(codes.device)
         return torch.cat((features, proposal_from_codes(codes[:, stages:])), 1)
+
+
+def _is_plain(tokens: Tensor) -> bool:
+    return tokens.device.type == "cpu" and tokens.dtype == torch.float32
+
+
+def _encode_in_loops(tokens: Tensor, tables: CentreTables) -> Tensor:
+    """Encode tokens (N, C + PROPOSAL_DIM) to codes (N, W) uint8, on the CPU."""
+    stages, _, channels = tables.centres.shape
+    tokens = tokens.detach()
+    proposal, codes = tokens[:, channels:], torch.empty(len(tokens), stages + PROPOSAL_CODES, dtype=torch.uint8)
+    # The arc tangent by the reference itself, so that yaws between two codes fall on the same side.
+    yaw, rows, out = axis_yaw(proposal[:, BOX_LAYOUT.axis]).numpy(), tokens.contiguous().numpy(), codes.numpy()
+    features = np.empty((len(rows), stages), np.uint8)
+    encode_features(np.ascontiguousarray(rows[:, :channels]), tables, features)
+    out[:, :stages] = features
+    proposals, sent = np.ascontiguousarray(rows[:, channels:]), np.empty((len(rows), PROPOSAL_CODES), np.uint8)
+    encode_proposals(proposals, yaw, _RULES, AXIS_STEP, sent)
+    out[:, stages:] = sent
+    return codes
 
 
 def residual_codes(features: Tensor, centres: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import copy
 
+from manyeyes.models.detector.codebook import Codebook
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.encoder import SparseEncoder
 from manyeyes.models.detector.layers import DownLayer, SubmanifoldLayer, SubmanifoldStage, UpLayer
@@ -23,6 +24,7 @@ _FOLDED = (
     SpatioTemporalEncoding,
     PastAttention,
     TokenMerge,
+    Codebook,
 )
 
 

@@ -29,6 +29,8 @@ _STEPS = (
     (BOX_LAYOUT.iou_logit, 1 / 16),
     (BOX_LAYOUT.velocity, 0.25 / SPEED_UNIT),
 )
+AXIS_STEP = 256 / math.pi
+"""Bytes of the code of an axis per radian."""
 _FACING_STEP = 1 / 8
 _LEADS = 256 // len(VEHICLE_LABELS)
 _LEAD_STEP = 16 / _LEADS
@@ -63,7 +65,7 @@ def proposal_to_codes(proposal: Tensor) -> Tensor:
     """Encode proposals (N, PROPOSAL_DIM) to (N, PROPOSAL_CODES) uint8."""
     columns, steps = (part.to(proposal.device) for part in (_COLUMNS, _COLUMN_STEPS))
     single = _encode_signed(proposal[:, columns], steps)
-    axis = torch.remainder(torch.round(axis_yaw(proposal[:, BOX_LAYOUT.axis]) * (256 / math.pi)), 256)
+    axis = torch.remainder(torch.round(axis_yaw(proposal[:, BOX_LAYOUT.axis]) * AXIS_STEP), 256)
     facing = (proposal[:, BOX_LAYOUT.direction] * _along(axis)).sum(1)
     best = proposal[:, BOX_LAYOUT.class_logits].topk(2, dim=1)
     lead = torch.floor((best.values[:, 0] - best.values[:, 1]) / _LEAD_STEP).clamp(0, _LEADS - 1)
