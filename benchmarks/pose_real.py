@@ -8,7 +8,8 @@ vehicles beside and ahead of each other, each with the identity filter and witho
 Every line states a rate with its one-sided 95 % bound (Clopper-Pearson) and its target. Constants were chosen on seed 101; this
 command uses other seeds.
 
-python -m benchmarks.pose_real [--tables answers nulls ...] [--scale 1.0] [--out benchmarks/results/pose_real.json]
+python -m benchmarks.pose_real [--tables answers nulls ...] [--boxes "15 x 17" ...] [--scale 1.0]
+    [--out benchmarks/results/pose_real.json]
 """
 
 from __future__ import annotations
@@ -125,10 +126,10 @@ def observe(scene: LandmarkScene) -> tuple[Landmarks, Landmarks]:
     return Landmarks.of_boxes(scene.ego[0]), Landmarks.of_boxes(scene.other[0])
 
 
-def answers(count: int, correct: Correct) -> Iterator[Line]:
+def answers(count: int, correct: Correct, sizes: Sequence[str] = tuple(OWN_BOXES)) -> Iterator[Line]:
     """Yield the lines of true scenes without a prior."""
     everything: list[Outcome] = []
-    for size, own in OWN_BOXES.items():
+    for size, own in ((s, b) for s, b in OWN_BOXES.items() if s in sizes):
         for name, common in COMMON.items():
             if (size, name) not in MIN_ANSWERED and name == "4":
                 continue
@@ -150,15 +151,17 @@ def answers(count: int, correct: Correct) -> Iterator[Line]:
             )
             nees = [o.nees for o in answered if o.is_within(2.0)]
             yield make_mean_line(f"{what}: mean NEES", nees, (None, None))
+    if not everything:
+        return
     nees_all = np.array([o.nees for o in everything if o.is_within(2.0)])
     yield make_mean_line("answers, all: mean NEES", nees_all.tolist(), (2.2, 3.4))
     yield make_rate_line("answers, all: inside the 95 % ellipsoid", nees_all < 7.815, (0.89, None))
     yield make_rate_line("answers, all: inside the 99 % ellipsoid", nees_all < 11.345, (0.96, None))
 
 
-def nulls(count: int, correct: Correct) -> Iterator[Line]:
+def nulls(count: int, correct: Correct, sizes: Sequence[str] = tuple(NULL_BOXES)) -> Iterator[Line]:
     """Yield the lines of agents without common objects."""
-    for size, boxes in NULL_BOXES.items():
+    for size, boxes in ((s, b) for s, b in NULL_BOXES.items() if s in sizes):
         for name, spec in (
             ("two places", LandmarkSpec(0, *boxes, REAL_BOXES, disjoint=True)),
             ("one place", LandmarkSpec(0, *boxes, REAL_BOXES, parked_fraction=0.5)),
@@ -176,8 +179,8 @@ def nulls(count: int, correct: Correct) -> Iterator[Line]:
             yield make_rate_line(f"nulls, {size}, {name}: wrong by more than 3 m", wrong, (None, 0.005))
 
 
-def clutter(count: int, correct: Correct) -> Iterator[Line]:
-    """Yield the lines of sensor-fixed clutter and of honest pairs close to each other."""
+def clutter(count: int, correct: Correct, sizes: Sequence[str] = ()) -> Iterator[Line]:
+    """Yield the lines of sensor-fixed clutter and of honest pairs close to each other; their densities are their own."""
     for common in (4, 8):
         outcomes = []
         for n in range(count):
@@ -213,7 +216,7 @@ def _honest_pairs() -> Iterator[tuple[str, LandmarkSpec, tuple[float, float] | N
     yield "dense, no prior", LandmarkSpec(8, 30, 40, REAL_BOXES), None
 
 
-TABLES: dict[str, tuple[Callable[[int, Correct], Iterator[Line]], int]] = {
+TABLES: dict[str, tuple[Callable[[int, Correct, Sequence[str]], Iterator[Line]], int]] = {
     "answers": (answers, 600),
     "nulls": (nulls, 3000),
     "clutter": (clutter, 3000),
@@ -236,6 +239,7 @@ def main() -> None:
     """The benchmark."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--tables", nargs="+", choices=list(TABLES), default=list(TABLES))
+    parser.add_argument("--boxes", nargs="+", choices=list(NULL_BOXES), default=list(NULL_BOXES), help="densities")
     parser.add_argument("--scale", type=float, default=1.0, help="of the numbers of scenes")
     parser.add_argument("--corrector", default="voting")
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results/pose_real.json"))
@@ -243,7 +247,7 @@ def main() -> None:
     lines = []
     for name in options.tables:
         table, count = TABLES[name]
-        for line in table(max(round(options.scale * count), 2), load_corrector(options.corrector)):
+        for line in table(max(round(options.scale * count), 2), load_corrector(options.corrector), options.boxes):
             sys.stdout.write(f"{line}\n")
             sys.stdout.flush()
             lines.append(line)

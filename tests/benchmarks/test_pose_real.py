@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from benchmarks.pose_real import judge, make_mean_line, make_rate_line
+from benchmarks.pose_real import answers, judge, make_mean_line, make_rate_line, nulls
 
+from manyeyes.pose.registry import load_corrector
 from manyeyes.pose.types import PoseStatus, no_estimate
 
 
@@ -26,3 +27,14 @@ def test_a_mean_is_held_to_both_limits() -> None:
 def test_no_answer_is_never_right() -> None:
     outcome = judge(no_estimate(None, PoseStatus.AMBIGUOUS), np.zeros(3))
     assert not outcome.is_within(1e9) and np.isnan(outcome.nees)
+
+
+def test_nulls_are_limited_to_the_requested_densities_and_both_kinds() -> None:
+    correct = load_corrector("voting")
+    names = [line.what for line in nulls(2, correct, ["15 x 17"])]
+    assert names == [
+        "nulls, 15 x 17, two places: answered",
+        "nulls, 15 x 17, one place: answered",
+        "nulls, 15 x 17, one place: wrong by more than 3 m",
+    ]
+    assert list(answers(2, correct, ["40 x 50"])) == []

@@ -33,7 +33,9 @@ def make_pair(common: int, index: int) -> LandmarkPair:
     back = EGO_FROM_OTHER.inverse()
     there = np.array([*back.translation[:2].tolist(), float(back.yaw)])
     other = ego.transform(there) if common else make_landmarks(10, index + 50)
-    return LandmarkPair("drive", index, 7, ego, other, EGO_FROM_OTHER, ego.xy[:common], 150 + index)
+    return LandmarkPair(
+        "drive", index, 7, ego, other, EGO_FROM_OTHER, ego.xy[:common], 150 + index, Transform.identity()
+    )
 
 
 def test_evaluations_follow_priors_and_objects() -> None:

@@ -200,9 +200,17 @@ def test_poses_are_evaluated_by_error_and_common_objects_and_stored(data, tmp_pa
     assert conflict == [0, 0, 4, 0, 0]
     assert {r["common_range"][0] for r in held["rows"] if r["common_range"]} == {8}
     assert all(100 < r["bytes_per_message"] < 400 and len(r["risk_by_coverage"]) == 20 for r in held["rows"])
+    # Every scene holds the same vehicles at the same places: at the same place the pose is right, at "another" one it is not.
+    nulls = {(r["corrector"], r["kind"]): r for r in held["nulls"]}
+    assert set(nulls) == {(c, k) for c in ("identity", "voting", "coalign") for k in ("other place", "same place")}
+    other, same = nulls["voting", "other place"], nulls["voting", "same place"]
+    assert other["num_null"] == same["num_null"] == 4 == other["num_true"]
+    assert other["answered"] == other["wrong"] == same["answered"] == 1.0 and same["wrong"] == 0.0
+    assert other["risk_by_coverage"] == [0.5] * 20 and same["risk_by_coverage"] == [0.0] * 20
+    assert nulls["identity", "same place"]["answered"] == 0.0 and nulls["identity", "same place"]["coverage"] == 0.0
     calls.clear()
     again = evaluate(data, tmp_path, "pose-estimation", "--correctors", "identity", "voting", "coalign")
-    assert not calls and again["rows"] == held["rows"]
+    assert not calls and again["rows"] == held["rows"] and str(again["nulls"]) == str(held["nulls"])
     assert not math.isnan(rows["voting", "gaussian", 0.8]["score"]["mean_displacement_m"])
 
 

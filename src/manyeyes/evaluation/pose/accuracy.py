@@ -48,7 +48,7 @@ MAX_UNMATCHABLE_OBJECTS = 1
 @dataclass(frozen=True)
 class LandmarkPair:
     """An ego and one other agent at one instant. ego_from_other: ego_from_other; common_xy: (K, 2) true places, in the ego's frame,
-    of the objects that both list. message_bytes: of the other's landmarks as a message on the wire.
+    of the objects that both list. message_bytes: of the other's landmarks as a message on the wire. world_from_ego: true.
     """
 
     scenario: str
@@ -59,6 +59,7 @@ class LandmarkPair:
     ego_from_other: Transform
     common_xy: Floats
     message_bytes: int
+    world_from_ego: Transform
 
 
 @dataclass(frozen=True)
@@ -166,6 +167,7 @@ def _make_landmark_pairs(
             ego_from_world @ truth.world_from_agent[row],
             ego_from_world.apply(both)[:, :2].numpy(),
             sum(map(len, wire.encode(message))),
+            truth.world_from_agent[0],
         )
 
 

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of corrected poses on agents' own detections, by corrector, noise of the prior and common objects."""
+"""Errors of corrected poses on agents' own detections, by corrector, noise of the prior and common objects; and risk against
+coverage among pairs of agents that do not belong together (evaluation/pose/null_pairs.py).
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -19,6 +22,14 @@ from manyeyes.evaluation.pose.accuracy import (
     summarize_run,
 )
 from manyeyes.evaluation.pose.metrics import PriorNoise
+from manyeyes.evaluation.pose.null_pairs import (
+    COVERAGES,
+    NULL_KINDS,
+    NullRisk,
+    NullRun,
+    run_null_pairs,
+    summarize_null_run,
+)
 from manyeyes.evaluation.statistics.bootstrap import exact_interval
 from manyeyes.models.checkpoint import fingerprint
 from manyeyes.pose.registry import load_corrector
@@ -31,6 +42,7 @@ from manyeyes.viz.progress import make_progress_bars
 from manyeyes.viz.study_table import StudyTable, format_number
 
 COMPUTED_BY = ("manyeyes.evaluation.pose.accuracy",)
+NULLS_COMPUTED_BY = ("manyeyes.evaluation.pose.null_pairs",)
 CORRECTORS = ("identity", "voting", "coalign", "fpv-rcnn", "feaco", "v2x-reg-odist")
 SIGMAS = (0.0, 0.4, 0.8, 1.2, 2.0)
 NOISE_FAMILIES = (
@@ -53,18 +65,19 @@ def run(options: PoseEstimationOptions, context: StudyContext) -> None:
     study = open_study(options, context, BenchmarkConfig(options.weights))
     trials = [CorrectorTrial(n, PriorNoise("gaussian", s, s, options.seed)) for n in names for s in SIGMAS]
     trials += [CorrectorTrial(n, PriorNoise(kind, s, s, options.seed)) for n in names[:2] for kind, s in NOISE_FAMILIES]
-    result_rows = run_trials(study, trials)
-    tables = [_make_results_table(result_rows), _make_common_objects_table(result_rows)]
-    study.write_report({"rows": result_rows}, tables, make_panels(result_rows))
+    result_rows, nulls = run_trials(study, trials)
+    tables = [_make_results_table(result_rows), _make_common_objects_table(result_rows), _make_null_table(nulls)]
+    panels = [*make_panels(result_rows), *make_null_panels(nulls)]
+    study.write_report({"rows": result_rows, "nulls": nulls}, tables, panels)
 
 
-def run_trials(study: ReplayStudy, trials: Sequence[CorrectorTrial]) -> list[AccuracyRow]:
-    """Return the rows of every trial; stored results are not computed again."""
+def run_trials(study: ReplayStudy, trials: Sequence[CorrectorTrial]) -> tuple[list[AccuracyRow], list[NullRisk]]:
+    """Return the rows of every trial, and the risk among null pairs of every corrector; stored results are not computed again."""
     pairs_by_net: dict[str, list[LandmarkPair]] = {}
     stride, detector = study.base.frame_stride, load_detector(study.base.weights)
     recording = study.opener()
     data_key = hash_recording(recording), detector.fingerprint.hex(), stride
-    nets = {name: PoseCorrection(name).net for name in {trial.corrector for trial in trials}}
+    nets = {name: PoseCorrection(name).net for name in dict.fromkeys(trial.corrector for trial in trials)}
     net_fingerprints = {name: "" if net is None else fingerprint(net).hex() for name, net in nets.items()}
 
     def get_pairs(name: str) -> list[LandmarkPair]:
@@ -83,7 +96,13 @@ def run_trials(study: ReplayStudy, trials: Sequence[CorrectorTrial]) -> list[Acc
             key = trial, net_fingerprints[trial.corrector], data_key
             cell = Cell[CorrectorRun](f"pose-{Path(trial.corrector).stem}", CorrectorRun, key, COMPUTED_BY)
             out += summarize_run(trial, study.context.store.load_or_compute(cell, partial(run_trial, trial)))
-    return out
+        risks = list[NullRisk]()
+        for name in progress.track(list(nets), description="Null pairs"):
+            key = name, net_fingerprints[name], data_key
+            cell = Cell[NullRun](f"pose-nulls-{Path(name).stem}", NullRun, key, NULLS_COMPUTED_BY)
+            run = study.context.store.load_or_compute(cell, lambda name=name: run_null_pairs(get_pairs(name), name))
+            risks += summarize_null_run(name, run)
+    return out, risks
 
 
 def _noise_name(row: AccuracyRow) -> str:
@@ -140,6 +159,41 @@ def _make_common_objects_table(result_rows: Sequence[AccuracyRow]) -> StudyTable
     )
     headings = ("corrector", "noise", "common objects", *_SCORE_HEADINGS[:13])
     return StudyTable("By common objects", headings, lines)
+
+
+def _make_null_table(nulls: Sequence[NullRisk]) -> StudyTable:
+    """Tabulate the risk at every fifth coverage; empty where so many true pairs are not answered."""
+    shown = range(4, len(COVERAGES), 5)
+    headings = (
+        "corrector", "null pairs", "number", "answered [%]", "wrong [%]", "true pairs answered [%]",
+        *(f"risk at {100 * COVERAGES[k]:.0f} % [%]" for k in shown),
+    )  # fmt: skip
+    lines = tuple(
+        (
+            r.corrector,
+            r.kind,
+            format_number(r.num_null),
+            *(format_number(100 * x, 1) for x in (r.answered, r.wrong, r.coverage)),
+            *(format_number(100 * r.risk_by_coverage[k], 1) for k in shown),
+        )
+        for r in nulls
+    )
+    return StudyTable("Risk and coverage with null pairs, without priors", headings, lines)
+
+
+def make_null_panels(nulls: Sequence[NullRisk]) -> list[CurvePanel]:
+    """Return risk against coverage for each kind of null pairs, a line for each corrector that answers."""
+    out = []
+    for kind in NULL_KINDS:
+        curves = []
+        for risk in (r for r in nulls if r.kind == kind):
+            points = [(c, exact_interval(y)) for c, y in zip(COVERAGES, risk.risk_by_coverage) if not math.isnan(y)]
+            if points:
+                curves.append(Curve(risk.corrector, tuple(y for _, y in points), tuple(c for c, _ in points)))
+        if curves:
+            ylabel = "fraction of wrong answers"
+            out.append(CurvePanel(f"No prior, nulls: {kind}", "coverage of true pairs", ylabel, tuple(curves)))
+    return out
 
 
 def make_panels(result_rows: Sequence[AccuracyRow]) -> list[CurvePanel]:
