@@ -11,6 +11,8 @@ import pytest
 
 import manyeyes
 from manyeyes.datatypes import ConfigError, ShapeError
+from manyeyes.models import checkpoint, pretrained
+from manyeyes.pose.feakm import FeakmCorrector
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.registry import (
     POSE_CORRECTORS,
@@ -107,6 +109,14 @@ def test_wrong_shapes_name_the_columns() -> None:
 def test_a_name_that_cannot_be_used_is_one_error(name: str, why: str) -> None:
     with pytest.raises(ConfigError, match=why):
         load_corrector(name)
+
+
+def test_feakm_has_the_shipped_weights() -> None:
+    four, eight = load_corrector("feakm"), load_corrector("feakm@8")
+    shipped = checkpoint.fingerprint(pretrained.load_feakm())
+    for corrector in (four, eight):
+        assert isinstance(corrector, FeakmCorrector) and checkpoint.fingerprint(corrector.net) == shipped
+    assert four != eight
 
 
 def test_a_distribution_that_is_installed_adds_a_corrector(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -247,5 +247,9 @@ def _points(landmarks: Landmarks, descriptors: Floats) -> KeypointBatch:
 @register_pose_corrector(FEAKM, "weights")
 @cache
 def load_feakm_corrector(weights: str, min_pairs: int = 4) -> FeakmCorrector:
-    """Return the corrector with the weights of a shipped name or a file; loaded once per process."""
-    return FeakmCorrector.of(pretrained.load_feakm(weights), min_pairs)
+    """Return the corrector with the weights of a shipped name or a file, the shipped ones by the corrector's own name; loaded once
+    per process.
+    """
+    return FeakmCorrector.of(
+        pretrained.load_feakm(pretrained.DEFAULT_FEAKM if weights == FEAKM else weights), min_pairs
+    )
