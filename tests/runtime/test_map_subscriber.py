@@ -3,27 +3,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import pytest
 
 pytest.importorskip("cryptography", reason="the extra live is not installed")
 
-from tests.runtime.conftest import Federation
-from tests.runtime.fault_team import PLACE, START_NS, AgentClock, FaultTeam, OneCar, frame_of
+from tests.runtime.conftest import START_S, Federation
+from tests.runtime.fault_team import MS, PLACE, START_NS, TENTH_NS, AgentClock, FaultTeam, OneCar, frame_of
 
 from manyeyes import Agent, AgentFrame, load_detector
 from manyeyes.agents.map_perception import rectangle
 from manyeyes.agents.map_server import MapServer
 from manyeyes.agents.periodic_map import PeriodicMapPredictor
 from manyeyes.agents.strategies.registry import get_strategy
+from manyeyes.comms.network.interface import Network, Origin, ReceivedPacket
+from manyeyes.comms.network.tiles import NetworkTile
+from manyeyes.comms.signatures.certificate import SENDER_RIGHTS
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import KINDS, MapElements
 from manyeyes.datatypes.message import LocalMap
 from manyeyes.runtime.authentication import PacketVerifier
-from manyeyes.runtime.clock import TAI_UTC_NS
+from manyeyes.runtime.clock import TAI_UTC_NS, Clock
+from manyeyes.runtime.keys import Identity, Issuer, Validity, generate_key, public_bytes
 from manyeyes.runtime.map_subscriber import MapSubscriber
+from manyeyes.runtime.signing import PacketSigner
 from manyeyes.runtime.transports.local import LocalNetwork
 
 DIVIDER = [KINDS.index("divider")]
@@ -79,6 +86,138 @@ def test_maps_beside_coded_tokens_are_used_without_the_weights_of_the_tokens(dri
     team.ns += 10**8
     sender.send(later[:-1], (0.0, 0.0))
     assert subscriber.poll() == 0
+
+
+LINK = Origin("link")
+
+
+class Wire:
+    """A network whose packets the test puts there. arrived: what the next poll returns."""
+
+    def __init__(self) -> None:
+        self.arrived: list[ReceivedPacket] = []
+
+    def put(self, packets: Iterable[bytes], arrival_ns: int, origin: Origin = LINK) -> None:
+        self.arrived += [ReceivedPacket(packet, arrival_ns, origin) for packet in packets]
+
+    def poll(self) -> list[ReceivedPacket]:
+        arrived, self.arrived = self.arrived, []
+        return arrived
+
+
+class FixedClock:
+    def __init__(self, now_ns: int) -> None:
+        self.time_ns = now_ns
+
+    def now_ns(self) -> int:
+        return self.time_ns
+
+
+class Receiver:
+    """A map server in mode require, and an honest signed sender, agent 1, of a line a frame."""
+
+    def __init__(self, federation: Federation) -> None:
+        self.wire, self.clock = Wire(), FixedClock(START_NS)
+        verifier = PacketVerifier(federation.trust, utc_offset_ns=-TAI_UTC_NS)
+        server = MapServer(origin_xy=PLACE)
+        self.subscriber = MapSubscriber(server, cast(Network, self.wire), cast(Clock, self.clock), verifier)
+        self.signer = PacketSigner(federation.identity(1))
+        self.agent = Agent(OneCar(), get_strategy("late"), map_predictor=predict_line)
+
+    def share(self, number: int) -> list[bytes]:
+        """The unsigned packets of a frame."""
+        return self.agent.share(frame_of(1, START_NS + number * TENTH_NS))
+
+    def send(self, packets: list[bytes], number: int, origin: Origin = LINK, late_ns: int = MS) -> int:
+        """Let packets arrive after a frame; return the number of new observations."""
+        self.clock.time_ns = START_NS + number * TENTH_NS + late_ns
+        self.wire.put(packets, self.clock.time_ns, origin)
+        return self.subscriber.poll()
+
+    def digest(self) -> list[bytes]:
+        """The fused map, bit for bit."""
+        fused = self.subscriber.server.rebuild()
+        return [fused.elements.polyline(row).tobytes() for row in range(len(fused))]
+
+
+def sign(signer: PacketSigner, packets: list[bytes]) -> list[bytes]:
+    return signer.sign(packets, START_NS - TAI_UTC_NS)
+
+
+def unknown_identity() -> Identity:
+    key = generate_key()
+    valid = Validity(START_S - 60)
+    return Identity(key, Issuer.of_anchor(generate_key()).issue(public_bytes(key), SENDER_RIGHTS, 1, valid))
+
+
+def hostile_packets(receiver: Receiver, federation: Federation, reason: str) -> list[bytes]:
+    """Packets of the sixth frame that are refused for a reason."""
+    plain = receiver.share(5)
+    signed = sign(receiver.signer, plain)
+    other = PacketSigner(federation.identity(2))
+    return {
+        "oversize": [signed[0] + bytes(100_000)],
+        "garbage": [b"", b"ME", bytes(200), signed[0][:40], b"MS"],
+        "version": [b"MS" + bytes(300), b"ME" + bytes([99]) + bytes(300)],
+        "checksum": [plain[0][:-1] + bytes([plain[0][-1] ^ 1])],
+        "unsigned": plain,
+        "forged": [one[:-1] + bytes([one[-1] ^ 1]) for one in signed],
+        "certificate": sign(PacketSigner(unknown_identity()), plain[:1]),
+        "identity": sign(other, plain),
+        "expired": sign(receiver.signer, receiver.share(-30)),
+        "future": sign(receiver.signer, receiver.share(60)),
+    }[reason]
+
+
+@pytest.mark.parametrize(
+    "reason",
+    [
+        "oversize",
+        "garbage",
+        "version",
+        "checksum",
+        "unsigned",
+        "forged",
+        "certificate",
+        "identity",
+        "expired",
+        "future",
+    ],
+)
+def test_a_hostile_packet_is_refused_by_its_reason_and_changes_no_map(federation: Federation, reason: str) -> None:
+    receiver = Receiver(federation)
+    for number in range(4):
+        assert receiver.send(sign(receiver.signer, receiver.share(number)), number) == 1
+    before, dropped = receiver.digest(), receiver.subscriber.dropped
+    hostile = hostile_packets(receiver, federation, reason)
+    assert dropped.total == 0 and receiver.send(hostile, 5, Origin("outside")) == 0
+    counts = {name: count for name, count in vars(receiver.subscriber.dropped).items() if count}
+    assert counts == {reason: len(hostile)} and receiver.digest() == before
+    # It goes on.
+    assert receiver.send(sign(receiver.signer, receiver.share(6)), 6) == 1
+    assert len(receiver.subscriber.server.observations) == 5 and receiver.subscriber.server.rejected == ()
+
+
+def test_replayed_packets_and_those_of_another_tile_change_no_map(federation: Federation) -> None:
+    receiver = Receiver(federation)
+    tile = NetworkTile.at(*PLACE)
+    sent = sign(receiver.signer, receiver.share(0))
+    assert receiver.send(sent, 0, Origin("link", tile.name)) == 1
+    before = receiver.digest()
+    assert receiver.send(sent, 0, Origin("link", tile.name), 2 * MS) == 0
+    assert receiver.subscriber.dropped.replayed == len(sent)
+    far = NetworkTile.at(PLACE[0] + 5_000.0, PLACE[1]).name
+    later = sign(receiver.signer, receiver.share(1))
+    assert receiver.send(later, 1, Origin("link", far)) == 0 and receiver.subscriber.dropped.tile == len(later)
+    assert receiver.digest() == before and receiver.send(later, 1, Origin("link", tile.name), 2 * MS) == 1
+
+
+def test_messages_that_waited_in_the_network_are_all_ingested(federation: Federation) -> None:
+    """A server that was busy for a second polls ten messages of one sender at once."""
+    receiver = Receiver(federation)
+    for number in range(10):
+        receiver.wire.put(sign(receiver.signer, receiver.share(number)), START_NS + number * TENTH_NS + MS)
+    assert receiver.send([], 10) == 10 and receiver.subscriber.server.num_incomplete == 0
 
 
 def test_a_map_is_sent_once_a_period() -> None:

@@ -18,7 +18,8 @@ from manyeyes.agents.map_server import MapServer
 from manyeyes.comms.admission import Authenticator
 from manyeyes.comms.drop_counts import DropCounts
 from manyeyes.comms.inbox import Inbox, ReceivedMessage
-from manyeyes.comms.network.interface import Network
+from manyeyes.comms.network.interface import Network, ReceivedPacket
+from manyeyes.comms.primitives import PacketError
 from manyeyes.comms.signatures.envelope import is_signed, split_signed
 from manyeyes.comms.wire import open_packet
 from manyeyes.runtime.clock import Clock
@@ -39,6 +40,7 @@ class MapSubscriber:
         self.server, self._network, self._clock = server, network, clock
         self._inbox = Inbox(authenticator=authenticator)
         self._unread: OrderedDict[tuple[int, int], set[int]] = OrderedDict()
+        self._coming: dict[int, int] = {}
 
     @property
     def dropped(self) -> DropCounts:
@@ -47,12 +49,33 @@ class MapSubscriber:
 
     def poll(self) -> int:
         """Receive what arrived since the last call; return the number of new observations."""
-        for received in self._network.poll():
-            before = self._inbox.dropped.wrong_model
-            self._inbox.push(received.packet, received.arrival_ns, received.origin)
-            if self._inbox.dropped.wrong_model > before:
-                self._record_unread(received.packet)
-        return len(self.server.ingest(map(self._complete, self._inbox.received_messages(self._clock.now_ns()))))
+        num_new = sum(map(self._take, self._network.poll()))
+        return num_new + self._ingest(self._clock.now_ns())
+
+    def _take(self, received: ReceivedPacket) -> int:
+        """Take a packet; return the number of new observations of messages before it.
+
+        The inbox keeps one message of a sender: where several waited in the network, each is ingested before the next one begins.
+        """
+        is_short = len(received.packet) <= self._inbox.limits.max_packet_bytes
+        stated, num_new = _read_stated(received.packet) if is_short else None, 0
+        if stated is not None and self._coming.get(stated[0], stated[1]) != stated[1]:
+            num_new = self._ingest(received.arrival_ns)
+        before = self._inbox.dropped
+        self._inbox.push(received.packet, received.arrival_ns, received.origin)
+        after = self._inbox.dropped
+        if after.wrong_model > before.wrong_model:
+            self._record_unread(received.packet)
+        elif after.total > before.total:
+            return num_new
+        if stated is not None:
+            self._coming[stated[0]] = stated[1]
+        return num_new
+
+    def _ingest(self, now_ns: int) -> int:
+        """Ingest the messages of the inbox that are not out of date at a time; return the number of new observations."""
+        self._coming.clear()
+        return len(self.server.ingest(map(self._complete, self._inbox.received_messages(now_ns))))
 
     def _record_unread(self, packet: bytes) -> None:
         """Record a packet of tokens that was refused after all checks of its sender."""
@@ -67,3 +90,12 @@ class MapSubscriber:
         num_unread = len(self._unread.get((one.message.agent_id, one.message.timestamp_ns), ()))
         is_complete = one.received_packets + num_unread >= one.expected_packets
         return replace(one, received_packets=one.expected_packets) if is_complete else one
+
+
+def _read_stated(packet: bytes) -> tuple[int, int] | None:
+    """Return the agent id and the time that a packet states; None where it cannot be read."""
+    try:
+        header = open_packet(split_signed(packet).packet if is_signed(packet) else packet).header
+    except PacketError:
+        return None
+    return header.agent_id, header.timestamp_ns

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run a whole team on this machine: a process for each agent of a drive, signed packets, one network, one table.
 
-Without a recording, the drive of 'manyeyes demo' is simulated. Where the processes do not fit on the cores, the clock is slowed
-down, and the rate is printed. Each run is recorded, and computed again from its recording.
+Without a recording, the drive of 'manyeyes demo' is simulated, with as many vehicles as the agents need. Where the processes do not
+fit on the cores, the clock is slowed down, and the rate is printed. Each run is recorded, and computed again from its recording.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -33,7 +33,7 @@ class Options:
     """How many agents of which drive."""
 
     agents: WorkerCount = 4
-    """Number of agents, the first ones of the drive."""
+    """Number of agents, the first ones of the drive; for more than 4 a drive with so many is simulated."""
     recording: InputPath | None = None
     """A recording; by default the drive of 'manyeyes demo' is simulated."""
     split: str | None = None
@@ -110,11 +110,18 @@ def _find_drive(options: Options, console: Console) -> tuple[Path, str | None]:
     """Return a recording and its split; simulate one where none is given."""
     if options.recording is not None:
         return options.recording, options.split
-    from manyeyes.simulator.presets import simulate
+    from manyeyes.simulator.presets import make_jobs, simulation_preset
+    from manyeyes.simulator.record import record
 
-    folder = options.out / "recording" / f"seed-{options.seed}"
+    preset = simulation_preset("demo")
+    # All its vehicles, and the roadside unit.
+    if options.agents > preset.vehicles[1] + 1:
+        preset = replace(preset, vehicles=(options.agents - 1, options.agents - 1))
+    num_agents = preset.vehicles[1] + 1
+    folder = options.out / "recording" / f"seed-{options.seed}-{num_agents}-agents"
+    made_of = {"preset": "demo", "seed": options.seed, "agents": num_agents}
     with console.status("Simulating a drive"):
-        simulate("demo", folder, options.seed, 1)
+        record(make_jobs(preset, options.seed), folder, 1, None, made_of)
     return folder, "test"
 
 

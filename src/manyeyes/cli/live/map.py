@@ -50,6 +50,7 @@ def main(options: Options) -> None:
     from manyeyes.runtime.map_subscriber import MapSubscriber
 
     verifier = options.security.load(0).make_verifier()
+    _compile_fusion()
     clock = announce_ready(options.await_start)
     network = options.network.open(OBSERVER_ID, clock.now_ns)
     try:
@@ -59,6 +60,25 @@ def main(options: Options) -> None:
     finally:
         network.close()
     Console().print(_write(subscriber, options.out), highlight=False, markup=False, soft_wrap=True)
+
+
+def _compile_fusion() -> None:
+    """Fuse two local maps of a line: compiled later, it would take longer than packets wait."""
+    import torch
+
+    from manyeyes.agents.map_perception import rectangle
+    from manyeyes.agents.map_server import MapServer
+    from manyeyes.comms.inbox import ReceivedMessage
+    from manyeyes.datatypes import Message, Transform
+    from manyeyes.datatypes.map_element import KINDS, MapElements
+    from manyeyes.datatypes.message import LocalMap
+
+    server, view = MapServer(), rectangle((0.0, -15.0, 30.0, 15.0))
+    for agent_id in (1, 2):
+        lines = MapElements.of([[[0.0, 0.1 * agent_id], [30.0, 0.0]]], [KINDS.index("divider")], 0.9)
+        header = Message(agent_id, 0, Transform.identity(), torch.zeros(3, 3).double(), local_map=LocalMap(lines, view))
+        server.ingest_message(ReceivedMessage(header, 1, 1, None))
+    server.rebuild()
 
 
 def _receive(subscriber: MapSubscriber, seconds: float | None) -> None:
@@ -85,8 +105,11 @@ def _write(subscriber: MapSubscriber, out: Path) -> str:
     write_vector_map(fused, out / "map")
     observed = MapElements.cat([one.elements_in_map() for one in observations]) if observations else None
     save_map_page(make_page("A map of live agents", fused, None, observed, len(observations)), out / "map.html")
-    agents = len({one.agent for one in observations})
+    agents, dropped = len({one.agent for one in observations}), subscriber.dropped
+    # Packets of tokens are of no use to a map.
+    counts = {name: count for name, count in vars(dropped).items() if count and name != "wrong_model"}
+    refused = "".join(f", {count} packets refused as {name}" for name, count in counts.items())
     return (
-        f"{len(observations)} local maps of {agents} agents, {server.num_incomplete} incomplete, {len(server.rejected)} rejected: "
-        f"{len(fused.select_published())} published elements of {len(fused)}; open {out / 'map.html'}"
+        f"{len(observations)} local maps of {agents} agents, {server.num_incomplete} incomplete, {len(server.rejected)} rejected"
+        f"{refused}: {len(fused.select_published())} published elements of {len(fused)}; open {out / 'map.html'}"
     )
