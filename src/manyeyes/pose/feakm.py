@@ -119,7 +119,7 @@ class ConsensusConfig:
     max_refined: int = 16
     min_separation_m: float = 2.0
     min_separation_rad: float = 0.105
-    accept: AcceptanceTest = field(default_factory=lambda: AcceptanceTest(min_score=18.0))
+    accept: AcceptanceTest = field(default_factory=lambda: AcceptanceTest(min_score=15.0))
 
     def __post_init__(self) -> None:
         limits = (
