@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from manyeyes.agents.agent import Agent
-from manyeyes.agents.perception_cache import MAX_EGO_STEP_M, MAX_GAP_NS, PerceptionCache, TokenOutput, is_consecutive
+from manyeyes.agents.perception_cache import MAX_EGO_STEP_M, MAX_GAP_NS, PerceptionCache, TokenOutput
 from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.agents.velocity import DEFAULT_VELOCITY_CONFIG, VelocityConfig
 from manyeyes.comms.inbox import Inbox
@@ -94,8 +94,8 @@ def discontinuous_frames(frame: AgentFrame) -> dict[str, AgentFrame]:
 def test_a_new_scenario_starts_without_history(drive, detector: Detector, name: str) -> None:
     before = drive().frame(0, 2)
     strange = discontinuous_frames(before)[name]
-    assert not is_consecutive(strange, before)
     cache = PerceptionCache(detector)
+    assert not cache.is_consecutive(strange, before)
     cache.process(before)
     assert same(cache, strange, PerceptionCache(detector), strange) and cache.previous_tokens(strange) == []
 
@@ -105,7 +105,16 @@ def test_the_longest_gap_and_the_farthest_drive_still_follow(drive, detector: De
     late = replace(before, timestamp_ns=before.timestamp_ns + MAX_GAP_NS)
     there = Transform.from_xyz_yaw(MAX_EGO_STEP_M - 1, 0.0) @ before.world_from_agent
     far = replace(before, timestamp_ns=before.timestamp_ns + TENTH_NS, world_from_agent=there)
-    assert is_consecutive(late, before) and is_consecutive(far, before)
+    cache = PerceptionCache(detector)
+    assert cache.is_consecutive(late, before) and cache.is_consecutive(far, before)
+
+
+def test_motions_are_those_of_the_frames_and_computed_once(drive, detector: Detector) -> None:
+    frames, cache = [drive().frame(0, k) for k in range(3)], PerceptionCache(detector)
+    for now, before in ((2, 1), (2, 0), (1, 0), (2, 0)):
+        motion, wanted = cache.motion_since(frames[now], frames[before]), frames[now].now_from_earlier(frames[before])
+        assert torch.equal(motion.rotation, wanted.rotation) and torch.equal(motion.translation, wanted.translation)
+        assert cache.motion_since(frames[now], frames[before]) is motion
 
 
 def test_at_most_max_frames_are_cached(drive, detector: Detector) -> None:

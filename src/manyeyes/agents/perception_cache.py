@@ -13,7 +13,7 @@ from torch.nn.functional import pad
 from manyeyes.agents._velocity_kernels import nearest_boxes
 from manyeyes.agents.level_frame import FrameLeveller
 from manyeyes.agents.velocity import DEFAULT_VELOCITY_CONFIG, PastDetections, VelocityConfig, estimate_velocities
-from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, SparseBev
+from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, PointCloud, SparseBev, Transform
 from manyeyes.models.detector.box_head import BOX_LAYOUT, SPEED_UNIT, DecodeConfig, RawBoxes, decode
 from manyeyes.models.detector.proposal import MAX_PROPOSAL, PROPOSAL_DIM
 from manyeyes.models.detector.protocols import BoxDetector, TokenDetector, has_tokens, require_tokens
@@ -102,6 +102,7 @@ class PerceptionCache:
         self._outputs: list[tuple[AgentFrame, AgentOutput]] = []
         self._merged: PerceptionCache | None = None
         self._sent: list[tuple[AgentFrame, SparseBev]] = []
+        self._motions: tuple[AgentFrame | None, list[tuple[AgentFrame, Transform]]] = None, []
         self.level = FrameLeveller()
         self.last_fused: tuple[AgentFrame, SparseBev] | None = None
 
@@ -113,19 +114,38 @@ class PerceptionCache:
     def clear(self) -> None:
         """Forget all frames."""
         self._outputs, self._merged, self._sent, self.last_fused = [], None, [], None
+        self._motions = None, []
+
+    def motion_since(self, frame: AgentFrame, before: AgentFrame) -> Transform:
+        """Return the motion from the agent's frame of an earlier instant to this one; those to the newest frame are kept."""
+        if self._motions[0] is not frame:
+            self._motions = frame, []
+        known = self._motions[1]
+        for earlier, motion in known:
+            if earlier is before:
+                return motion
+        known.append((before, frame.now_from_earlier(before)))
+        return known[-1][1]
+
+    def is_consecutive(self, frame: AgentFrame, before: AgentFrame) -> bool:
+        """Return whether a frame continues another one: same agent, a small time gap, a small displacement."""
+        gap = frame.timestamp_ns - before.timestamp_ns
+        if frame.agent_id != before.agent_id or not 0 < gap <= MAX_GAP_NS:
+            return False
+        return float(self.motion_since(frame, before).translation.norm()) <= MAX_EGO_STEP_M
 
     def process(self, frame: AgentFrame) -> AgentOutput:
         """Detector output on a frame, with its previous sweep if there is one."""
         for cached_frame, output in self._outputs:
             if cached_frame is frame:
                 return output
-        if self._outputs and not is_consecutive(frame, self._outputs[-1][0]):
+        if self._outputs and not self.is_consecutive(frame, self._outputs[-1][0]):
             self._outputs = []
         key = frame.agent_id, frame.timestamp_ns
         output = self._feature_cache.get(key) if self._feature_cache is not None else None
         if output is None:
             before = self._outputs[-1][0] if self._outputs else None
-            earlier = None if before is None else before.points.transform(frame.now_from_earlier(before))
+            earlier = None if before is None else before.points.transform(self.motion_since(frame, before))
             output = self._with_estimated_velocity(frame, self.run_detector(frame.points, earlier))
         if self._feature_cache is not None:
             self._feature_cache[key] = output
@@ -149,7 +169,7 @@ class PerceptionCache:
                 past_output.boxes.to(torch.float32),
                 (frame.timestamp_ns - before.timestamp_ns) / 1e9,
                 before.points,
-                frame.now_from_earlier(before),
+                self.motion_since(frame, before),
             )
             for before, past_output in self._outputs[: -TRACK_FRAMES - 1 : -1]
             if len(past_output.boxes)
@@ -171,7 +191,7 @@ class PerceptionCache:
         for before, output in self.previous_outputs(frame, num_frames):
             if isinstance(output, TokenOutput):
                 tokens, age_s = output.shared_tokens, (frame.timestamp_ns - before.timestamp_ns) / 1e9
-                motion, roadside = frame.now_from_earlier(before), before.is_infrastructure
+                motion, roadside = self.motion_since(frame, before), before.is_infrastructure
                 part = AgentTokens(0, tokens.features, tokens.sites.xy, motion, age_s, is_infrastructure=roadside)
                 parts.append(part)
         return parts
@@ -183,7 +203,7 @@ class PerceptionCache:
     def recently_sent(self, frame: AgentFrame) -> list[tuple[AgentFrame, SparseBev]]:
         """Return tokens sent in the frames before this one, oldest first: those still in the receivers' history."""
         earlier = [(then, tokens) for then, tokens in self._sent if then is not frame]
-        return [(then, tokens) for then, tokens in earlier[-HISTORY_FRAMES:] if is_consecutive(frame, then)]
+        return [(then, tokens) for then, tokens in earlier[-HISTORY_FRAMES:] if self.is_consecutive(frame, then)]
 
     @property
     def merged(self) -> PerceptionCache:
@@ -224,11 +244,3 @@ class PerceptionCache:
     def decode(self, raw: RawBoxes) -> Boxes:
         """Decoded boxes around one ego, in its frame, by falling score."""
         return decode(raw, self.token_detector.decode_config)[0]
-
-
-def is_consecutive(frame: AgentFrame, before: AgentFrame) -> bool:
-    """Return whether a frame continues another one: same agent, a small time gap, a small displacement."""
-    gap = frame.timestamp_ns - before.timestamp_ns
-    if frame.agent_id != before.agent_id or not 0 < gap <= MAX_GAP_NS:
-        return False
-    return float(frame.now_from_earlier(before).translation.norm()) <= MAX_EGO_STEP_M

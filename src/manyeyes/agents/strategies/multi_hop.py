@@ -12,7 +12,7 @@ from functools import partial
 
 import torch
 
-from manyeyes.agents.perception_cache import PerceptionCache, is_consecutive
+from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.intermediate import IntermediateFusion
 from manyeyes.agents.strategies.message_header import make_header
 from manyeyes.agents.strategies.redundancy import novelty_score
@@ -30,7 +30,7 @@ class MultiHopFusion(IntermediateFusion):
     ) -> Message | None:
         """Return the fused tokens of the previous frame if it is consecutive, else the agent's own tokens."""
         cache.process(frame)
-        if cache.last_fused is None or not is_consecutive(frame, cache.last_fused[0]):
+        if cache.last_fused is None or not cache.is_consecutive(frame, cache.last_fused[0]):
             return super().compose_message(cache, frame, requests)
         then, tokens = cache.last_fused
         score = torch.sigmoid(cache.token_detector.score_tokens(tokens))

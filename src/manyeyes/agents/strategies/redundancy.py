@@ -29,7 +29,7 @@ SAME_OBJECT_M = 2.0
 def novelty_score(cache: PerceptionCache, frame: AgentFrame) -> Tensor:
     """Return (N,) of the shared tokens of a frame: sigmoid(heat) * REDUNDANCY_DECAY^(earlier tokens of the object), or -inf."""
     tokens = cache.process_tokens(frame).shared_tokens
-    sent_centres = [_propagate_centres(frame, then, sent) for then, sent in cache.recently_sent(frame)]
+    sent_centres = [_propagate_centres(cache, frame, then, sent) for then, sent in cache.recently_sent(frame)]
     score = _decay_scores(tokens, torch.cat([tokens.features.new_empty(0, 2), *sent_centres]))
     return _drop_low(cache, score)
 
@@ -58,9 +58,9 @@ def proposed_centres(tokens: SparseBev) -> Tensor:
     return tokens.sites.xy + proposed_offset(tokens.features[:, -PROPOSAL_DIM:]) * tokens.grid.cell_size_m
 
 
-def _propagate_centres(frame: AgentFrame, then: AgentFrame, sent: SparseBev) -> Tensor:
+def _propagate_centres(cache: PerceptionCache, frame: AgentFrame, then: AgentFrame, sent: SparseBev) -> Tensor:
     """Return (N, 2): proposed centres of an earlier frame's tokens, propagated to this frame."""
-    seconds, motion = (frame.timestamp_ns - then.timestamp_ns) / 1e9, frame.now_from_earlier(then).double()
+    seconds, motion = (frame.timestamp_ns - then.timestamp_ns) / 1e9, cache.motion_since(frame, then).double()
     first = sent.features.shape[1] - PROPOSAL_DIM
     centres = propagate_centres(
         sent.features.float().contiguous().numpy(),
