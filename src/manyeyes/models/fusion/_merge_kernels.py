@@ -92,12 +92,15 @@ def encode_tokens(
     inputs = empty_rows(n, num_frame_columns + 2 + num_proposal_columns + pose_context.shape[1] - num_frame_columns)
     out, when, timed = empty_rows(n, channels), np.zeros(channels, np.float32), np.float32(0)
     for i in range(n):
-        row = inputs[i]
-        row[:num_frame_columns] = pose_context[i, :num_frame_columns]
-        row[num_frame_columns : num_frame_columns + 2] = cell_offset[i]
-        for k in range(num_proposal_columns):
-            row[num_frame_columns + 2 + k] = proposal[i, k] * weights.scale[k]
-        row[num_frame_columns + 2 + num_proposal_columns :] = pose_context[i, num_frame_columns:]
+        row, context, stated = inputs[i], pose_context[i], proposal[i]
+        for k in range(num_frame_columns):
+            row[k] = context[k]
+        row[num_frame_columns], row[num_frame_columns + 1] = cell_offset[i, 0], cell_offset[i, 1]
+        behind = row[num_frame_columns + 2 :]
+        for k in range(np.uintp(num_proposal_columns)):
+            behind[k] = stated[k] * weights.scale[k]
+        for k in range(num_frame_columns, context.shape[0]):
+            row[2 + num_proposal_columns + k] = context[k]
         age = pose_context[i, -1]
         # Tokens of one message have one age; that of age 0 has no encoding.
         if age != timed:
@@ -108,8 +111,9 @@ def encode_tokens(
                 sine, bend = np.sin(angle), np.cos(angle) - np.float32(1)
                 for c in range(channels):
                     when[c] += sine * weights.temporal[2 * k, c] + bend * weights.temporal[2 * k + 1, c]
-        for c in range(channels):
-            out[i, c] = features[i, c] + when[c]
+        to, given = out[i], features[i]
+        for c in range(np.uintp(channels)):
+            to[c] = given[c] + when[c]
     _add_layers(inputs, weights.layers, out)
     return out
 
@@ -194,10 +198,11 @@ def merge_tokens(
     count, score, apart = columns.end, columns.end + 1, columns.end + 2
     for i in range(n):
         r, w = row[i], share[i]
-        for k in range(num_proposal_columns):
-            merged_boxes[r, k] += w * boxes[i, k]
-        for c in range(channels):
-            merged[r, c] += w * features[i, c]
+        to, given, box, stated = merged[r], features[i], merged_boxes[r], boxes[i]
+        for k in range(np.uintp(num_proposal_columns)):
+            box[k] += w * stated[k]
+        for c in range(np.uintp(channels)):
+            to[c] += w * given[c]
         statistics[r, count] += np.float32(1)
         statistics[r, score] += np.float32(1) / (np.float32(1) + np.exp(-boxes[i, columns.heat]))
     for i in range(n):

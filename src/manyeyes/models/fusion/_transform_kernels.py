@@ -117,11 +117,15 @@ def _move_token(
     context[0], context[1], context[2] = height, link[5], link[7]
     context[3], context[4] = np.sqrt(link[3] * link[3] + spread * spread), link[2] / 0.1
     s, c, feature, moved = np.float32(link[5]), np.float32(link[6]), out.features[at], out.proposal[at]
-    for k in range(quarter):
-        feature[2 * k] = token[2 * k] * c - token[2 * k + 1] * s
-        feature[2 * k + 1] = token[2 * k] * s + token[2 * k + 1] * c
-    feature[2 * quarter :] = token[2 * quarter : channels]
-    moved[:] = stated
+    # Unsigned places: a signed one might count from the end, and the test for it keeps the loops from vectors.
+    two, one = np.uintp(2), np.uintp(1)
+    for k in range(np.uintp(quarter)):
+        a, b = token[two * k], token[two * k + one]
+        feature[two * k], feature[two * k + one] = a * c - b * s, a * s + b * c
+    for k in range(np.uintp(2 * quarter), np.uintp(channels)):
+        feature[k] = token[k]
+    for k in range(np.uintp(stated.shape[0])):
+        moved[k] = stated[k]
     moved[columns.z] += height
     for k in (columns.offset, columns.direction, columns.velocity):
         moved[k], moved[k + 1] = stated[k] * c - stated[k + 1] * s, stated[k] * s + stated[k + 1] * c
