@@ -26,6 +26,7 @@ __all__ = [
     "F64x1",
     "F64x2",
     "F64x3",
+    "I8x2",
     "I32x1",
     "I32x2",
     "I64x1",
@@ -69,6 +70,7 @@ F32x5 = np.ndarray[tuple[int, int, int, int, int], np.dtype[np.float32]]
 F64x1 = np.ndarray[tuple[int], np.dtype[np.float64]]
 F64x2 = np.ndarray[tuple[int, int], np.dtype[np.float64]]
 F64x3 = np.ndarray[tuple[int, int, int], np.dtype[np.float64]]
+I8x2 = np.ndarray[tuple[int, int], np.dtype[np.int8]]
 I32x1 = np.ndarray[tuple[int], np.dtype[np.int32]]
 I32x2 = np.ndarray[tuple[int, int], np.dtype[np.int32]]
 I64x1 = np.ndarray[tuple[int], np.dtype[np.int64]]

@@ -7,7 +7,8 @@ import math
 
 import numpy as np
 
-from manyeyes._jit import F64x1, F64x2, njit
+from manyeyes._jit import F32x1, F32x2, F64x1, F64x2, njit
+from manyeyes.models.detector._decode_kernels import DecodeLimits, RawColumns, decode_grid
 
 
 @njit(cache=True, nogil=True)
@@ -53,3 +54,32 @@ def place_claims(
         if is_finite and math.isfinite(columns[count, 6]) and math.isfinite(sigma_m[count]):
             count += 1
     return columns[:count], moved[:count], scores[:count], sigma_m[:count], stated[:count]
+
+
+@njit(cache=True, nogil=True)
+def place_proposals(
+    values: F32x2,
+    xy: F32x2,
+    heat: F32x1,
+    cell_m: float,
+    columns: RawColumns,
+    limits: DecodeLimits,
+    rotation: F64x2,
+    origin: F64x1,
+    numbers: F64x1,
+    max_claims: int,
+) -> tuple[F64x2, F64x2, F64x1, F64x1, F64x2]:  # pragma: no cover
+    """Do the same with the boxes that tokens propose; the first arguments are those of ``decode_grid``."""
+    found = decode_grid(values, xy, heat, cell_m, columns, limits)
+    return place_claims(
+        found.center.astype(np.float64),
+        found.size.astype(np.float64),
+        found.yaw.astype(np.float64),
+        found.velocity.astype(np.float64),
+        found.score.astype(np.float64),
+        found.sigma_xy.astype(np.float64),
+        rotation,
+        origin,
+        numbers,
+        max_claims,
+    )

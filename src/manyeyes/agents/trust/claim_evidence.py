@@ -9,18 +9,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import I64x2
-from manyeyes.agents.trust.association import Floats, Rows, associate
+from manyeyes.agents.trust._association_kernels import match_claims
+from manyeyes.agents.trust.association import Floats, Rows
 from manyeyes.agents.trust.claims import Claims
 from manyeyes.agents.trust.interface import Evidence
 from manyeyes.datatypes import AgentFrame
 from manyeyes.ops.lidar.box_rays import count_rays_of_columns
 
 Kinds = NDArray[np.uint8]
+# Members of an enumeration are slow to read.
+_UNCHECKED, _SUPPORTED = int(Evidence.UNCHECKED), int(Evidence.SUPPORTED)
+_CORROBORATED, _REFUTED = int(Evidence.CORROBORATED), int(Evidence.REFUTED)
 
 
 @dataclass(frozen=True)
@@ -74,30 +79,21 @@ def check_claims(
         own: (K, 2) metres, the ego's detections of min_own_score. trust: in each sender, before this frame.
         probes: (P, 7) further boxes, centre, size and yaw, whose rays are counted, without margin.
     """
-    gates = [config.gate_m + 2 * one.sigma_m for one in claims]
-    kinds = [
-        (associate(one.xy, own, gate) >= 0).astype(np.uint8) * Evidence.SUPPORTED for one, gate in zip(claims, gates)
-    ]
+    sizes = np.cumsum([0, *map(len, claims)])
+    xy = np.concatenate([np.zeros((0, 2)), *(one.xy for one in claims)])
+    gates = config.gate_m + 2 * np.concatenate([np.zeros(0), *(one.sigma_m for one in claims)])
+    is_trusted = np.array([trust.get(one.agent_id, 0.0) >= config.min_corroborating_trust for one in claims], np.bool_)
+    places = np.ascontiguousarray(own)
+    is_own, is_third = match_claims(xy, gates, sizes, places, is_trusted, config.copy_m, config.max_copied)
+    supported = is_own * np.uint8(_SUPPORTED)
+    kinds = [supported[begin:end] for begin, end in pairwise(sizes)]
     rays = _check_rays(frame, claims, kinds, config, probes)
     checked = list[CheckedClaims]()
-    for n, (one, kind) in enumerate(zip(claims, kinds)):
-        corroborated = np.zeros(len(one), np.bool_)
-        for k, third in enumerate(claims):
-            is_trusted = trust.get(third.agent_id, 0.0) >= config.min_corroborating_trust
-            if k != n and is_trusted and not are_copies(one.xy, third.xy, config):
-                corroborated |= associate(one.xy, third.xy, gates[n]) >= 0
-        kind[corroborated & (kind == Evidence.UNCHECKED)] = Evidence.CORROBORATED
+    for one, kind, begin in zip(claims, kinds, sizes):
+        corroborated = is_third[begin : begin + len(one)]
+        kind[corroborated & (kind == _UNCHECKED)] = _CORROBORATED
         checked.append(CheckedClaims(one, kind, corroborated))
     return tuple(checked), rays
-
-
-def are_copies(one: Floats, other: Floats, config: EvidenceConfig) -> bool:
-    """Return whether two senders state so many equal boxes that they are one source. Positions (N, 2) and (M, 2)."""
-    fewest = min(len(one), len(other))
-    if fewest < 2:
-        return False
-    is_equal = associate(one, other, config.copy_m) >= 0
-    return bool(is_equal.sum() > config.max_copied * fewest)
 
 
 def classify_rays(rays: I64x2, config: EvidenceConfig) -> Kinds:
@@ -105,7 +101,7 @@ def classify_rays(rays: I64x2, config: EvidenceConfig) -> Kinds:
     passing, hits = rays.T
     is_refuted = (passing >= config.min_passing) & (passing >= config.passing_ratio * hits)
     is_supported = (hits >= config.min_hits) & ~is_refuted
-    return (is_refuted * Evidence.REFUTED + is_supported * Evidence.SUPPORTED).astype(np.uint8)
+    return (is_refuted * _REFUTED + is_supported * _SUPPORTED).astype(np.uint8)
 
 
 def _check_rays(
@@ -116,7 +112,7 @@ def _check_rays(
     for one, kind in zip(claims, kinds):
         margin = config.margin_m + one.sigma_m.clip(config.min_sigma_m)
         is_near = np.hypot(*one.xy.T) <= config.max_range_m
-        rows.append(np.flatnonzero((kind == Evidence.UNCHECKED) & is_near & (margin <= config.max_margin_m)))
+        rows.append(np.flatnonzero((kind == _UNCHECKED) & is_near & (margin <= config.max_margin_m)))
         boxes.append(one.columns[rows[-1]])
         margins.append(margin[rows[-1]])
     rays = count_rays_of_columns(

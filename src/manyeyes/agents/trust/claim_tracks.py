@@ -11,9 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes.agents.trust._track_kernels import add_checks, count_refuted
 from manyeyes.agents.trust.association import Floats, Rows, associate
 from manyeyes.agents.trust.interface import Evidence
 
+_SUPPORTED, _DISPUTED, _REFUTED = int(Evidence.SUPPORTED), int(Evidence.DISPUTED), int(Evidence.REFUTED)
 NUM_CHECKS = 5
 """Number of evidences that a track keeps, the last ones."""
 NO_CHECK = -1
@@ -49,13 +51,6 @@ class ClaimTracks:
     def __len__(self) -> int:
         return len(self.xy)
 
-    def __getitem__(self, rows: Rows) -> ClaimTracks:
-        return ClaimTracks(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
-
-    def count(self, kind: Evidence) -> Rows:
-        """Return (K,) the number of checks of a kind."""
-        return (self.checks == kind).sum(1)
-
 
 def move_tracks(tracks: ClaimTracks, rotation: Floats, shift: Floats, seconds: float) -> ClaimTracks:
     """Return the tracks in the ego's frame after its motion, rotation (2, 2) and shift (2,), and after their own."""
@@ -82,29 +77,18 @@ class ClaimChecks:
 
 def update_tracks(tracks: ClaimTracks, checks: ClaimChecks, now_ns: int) -> ClaimTracks:
     """Return the tracks of the N claims, in their order, then those that are not claimed now and have not ended."""
-    is_known, before = checks.track >= 0, tracks[checks.track.clip(0)] if len(tracks) else None
-    shape = (len(checks.xy), NUM_CHECKS - 1)
-    history, supported, refuted = np.full(shape, NO_CHECK, np.int8), *np.zeros((2, len(checks.xy)), np.int64)
-    if before is not None:
-        history[is_known] = before.checks[is_known, :-1]
-        supported[is_known], refuted[is_known] = before.supported_ns[is_known], before.refuted_ns[is_known]
-    supported[checks.evidence == Evidence.SUPPORTED] = now_ns
-    refuted[checks.evidence == Evidence.REFUTED] = now_ns
-    claimed = ClaimTracks(
-        checks.xy,
-        checks.velocity,
-        np.concatenate((checks.evidence[:, None].astype(np.int8), history), 1),
-        checks.score,
-        np.full(len(checks.xy), now_ns, np.int64),
-        supported,
-        refuted,
+    numbers = now_ns, MAX_UNCLAIMED_NS, MAX_TRACKS, _SUPPORTED, _REFUTED
+    times_ns = tracks.claimed_ns, tracks.supported_ns, tracks.refuted_ns
+    history, *found_ns, left = add_checks(tracks.checks, times_ns, checks.track, checks.evidence, numbers)
+    return ClaimTracks(
+        np.concatenate((checks.xy, tracks.xy[left])),
+        np.concatenate((checks.velocity, tracks.velocity[left])),
+        history,
+        np.concatenate((checks.score, tracks.score[left])),
+        *found_ns,
     )
-    is_left = np.abs(now_ns - tracks.claimed_ns) <= MAX_UNCLAIMED_NS
-    is_left[checks.track[is_known]] = False
-    return concatenate(claimed, tracks[np.flatnonzero(is_left)[: max(0, MAX_TRACKS - len(claimed))]])
 
 
-def concatenate(one: ClaimTracks, other: ClaimTracks) -> ClaimTracks:
-    """Return the tracks of both."""
-    names = one.__dataclass_fields__
-    return ClaimTracks(*(np.concatenate((getattr(one, name), getattr(other, name))) for name in names))
+def count_refuted_checks(tracks: ClaimTracks, min_score: float) -> Rows:
+    """Return (K,) the number of refuted checks of each track; 0 of a score below, or where a check is supported or disputed."""
+    return count_refuted(tracks.checks, tracks.score, min_score, _REFUTED, (_SUPPORTED, _DISPUTED))

@@ -5,19 +5,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from manyeyes.agents.perception_cache import PerceptionCache
-from manyeyes.agents.strategies.message_header import age_s, ego_from_sender
-from manyeyes.agents.trust._claim_kernels import place_claims
+from manyeyes.agents.strategies.message_header import age_s
+from manyeyes.agents.trust._claim_kernels import place_claims, place_proposals
 from manyeyes.agents.trust.association import Floats
-from manyeyes.datatypes import AgentFrame, Boxes, Message
-from manyeyes.models.detector._decode_kernels import DecodedBoxes
-from manyeyes.models.detector.box_head import decode_rows
+from manyeyes.datatypes import AgentFrame, Boxes, Message, Transform
+from manyeyes.models.detector.box_head import DecodeConfig, make_decode_arguments
 from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.detector.protocols import has_tokens
 
@@ -77,27 +75,27 @@ class Claims:
 
 def extract_claims(frame: AgentFrame, cache: PerceptionCache, messages: Sequence[Message]) -> tuple[Claims, ...]:
     """Return the claims of each message of MIN_SCORE. Clouds claim nothing: a detector would have to run on each."""
-    return tuple(_extract(frame, cache, message) for message in messages)
+    detector = cache.detector
+    config = replace(detector.decode_config, score_threshold=MIN_SCORE) if has_tokens(detector) else None
+    ego_from_world = frame.world_from_agent.inverse()
+    return tuple(_extract(frame, ego_from_world, config, message) for message in messages)
 
 
-def _extract(frame: AgentFrame, cache: PerceptionCache, message: Message) -> Claims:
-    ego_from_other, seconds = ego_from_sender(frame, message), age_s(frame, message)
+def _extract(frame: AgentFrame, ego_from_world: Transform, config: DecodeConfig | None, message: Message) -> Claims:
+    ego_from_other, seconds = ego_from_world @ message.world_from_agent, age_s(frame, message)
     rotation, origin = ego_from_other.rotation.numpy(), ego_from_other.translation.numpy()
     x, y, yaw = np.diagonal((frame.pose_covariance + message.pose_covariance).double().numpy()).clip(0).tolist()
     variances = (x + y) / 2 + (SIGMA_VELOCITY_MPS * seconds) ** 2, yaw
-    stated = _stated_boxes(cache, message)
-    columns, velocity, score, sigma_m, stated_xy = place_claims(
-        stated.center,
-        stated.size,
-        stated.yaw,
-        stated.velocity,
-        stated.score,
-        stated.sigma_xy,
-        rotation,
-        origin,
-        np.array([seconds, *variances, MIN_SCORE]),
-        MAX_CLAIMS,
-    )
+    numbers, tokens = np.array([seconds, *variances, MIN_SCORE]), message.tokens
+    if message.objects is None and tokens is not None and config and tokens.features.shape[1] >= PROPOSAL_DIM:
+        proposals = make_decode_arguments(tokens.features[:, -PROPOSAL_DIM:], tokens.sites, config)
+        placed = place_proposals(*proposals, rotation, origin, numbers, MAX_CLAIMS)
+    else:
+        boxes = Boxes.empty() if message.objects is None else message.objects
+        parts = (boxes.center, boxes.size, boxes.yaw, boxes.velocity, boxes.score, boxes.sigma_xy)
+        center, size, yaw, motion, scores, sigma = (column.double().contiguous().numpy() for column in parts)
+        placed = place_claims(center, size, yaw, motion, scores, sigma, rotation, origin, numbers, MAX_CLAIMS)
+    columns, velocity, score, sigma_m, stated_xy = placed
     return Claims(
         message.agent_id,
         columns,
@@ -109,31 +107,3 @@ def _extract(frame: AgentFrame, cache: PerceptionCache, message: Message) -> Cla
         message.objects is not None and message.tokens is None,
         stated_xy,
     )
-
-
-class _StatedBoxes(NamedTuple):
-    """Boxes in their sender's frame: (N, 3), (N, 3), (N,), (N, 2), (N,), (N,)."""
-
-    center: Floats
-    size: Floats
-    yaw: Floats
-    velocity: Floats
-    score: Floats
-    sigma_xy: Floats
-
-    @classmethod
-    def of(cls, boxes: Boxes | DecodedBoxes) -> _StatedBoxes:
-        """Return the columns of boxes in float64."""
-        columns = (boxes.center, boxes.size, boxes.yaw, boxes.velocity, boxes.score, boxes.sigma_xy)
-        return cls(*(np.ascontiguousarray(column, np.float64) for column in columns))
-
-
-def _stated_boxes(cache: PerceptionCache, message: Message) -> _StatedBoxes:
-    """Return the boxes that a message sends, or that its tokens propose."""
-    tokens, detector = message.tokens, cache.detector
-    if message.objects is not None:
-        return _StatedBoxes.of(message.objects)
-    if tokens is None or not has_tokens(detector) or tokens.features.shape[1] < PROPOSAL_DIM:
-        return _StatedBoxes.of(Boxes.empty())
-    config = replace(detector.decode_config, score_threshold=MIN_SCORE)
-    return _StatedBoxes.of(decode_rows(tokens.features[:, -PROPOSAL_DIM:], tokens.sites, config))

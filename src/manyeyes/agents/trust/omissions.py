@@ -59,6 +59,8 @@ class OwnObjects:
 
     def follow(self, now: OwnObjects, rotation: Floats, shift: Floats, seconds: float) -> OwnObjects:
         """Return the objects of now with their number of frames; rotation (2, 2), shift (2,): motion of the ego since."""
+        if not len(self) or not len(now):
+            return OwnObjects(now.columns, now.velocity, np.ones(len(now), np.int64))
         expected = (self.columns[:, :2] + self.velocity * seconds) @ rotation.T + shift
         partner = associate(now.columns[:, :2], expected, 2.0)
         earlier = np.append(self.num_frames, 0)[partner]

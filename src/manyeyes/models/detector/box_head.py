@@ -8,9 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from manyeyes._jit import F32x1, F32x2
 from manyeyes.datatypes import LABELS, VEHICLE_LABELS, VEHICLES, Boxes, ConfigError, Sites, SparseBev
 from manyeyes.models.detector._decode_kernels import DecodedBoxes, DecodeLimits, RawColumns, decode_grid
 from manyeyes.models.detector.layers import SubmanifoldLayer
@@ -247,9 +249,16 @@ def decode(raw: RawBoxes, config: DecodeConfig) -> list[Boxes]:
 
 def decode_rows(rows: Tensor, sites: Sites, config: DecodeConfig) -> DecodedBoxes:
     """Decode rows (N, BOX_LAYOUT.total) of one grid, on the CPU, as :func:`decode` does those of a head of one class, to arrays."""
-    columns = (rows, sites.xy, rows[:, BOX_LAYOUT.heatmap_logit][:, 0])
-    values, xy, heat = (column.detach().float().contiguous().numpy() for column in columns)
-    return decode_grid(values, xy, heat, float(sites.grid.cell_size_m), _RAW_COLUMNS, _make_limits(config))
+    return decode_grid(*make_decode_arguments(rows, sites, config))
+
+
+def make_decode_arguments(
+    rows: Tensor, sites: Sites, config: DecodeConfig
+) -> tuple[F32x2, F32x2, F32x1, float, RawColumns, DecodeLimits]:
+    """Return the arguments of the compiled ``decode_grid`` for rows (N, BOX_LAYOUT.total) of one grid, on the CPU."""
+    values, heat = rows.detach().float().contiguous().numpy(), BOX_LAYOUT.heatmap_logit.start
+    xy, cell_m = np.ascontiguousarray(sites.xy.numpy()), float(sites.grid.cell_size_m)
+    return values, xy, np.ascontiguousarray(values[:, heat]), cell_m, _RAW_COLUMNS, _make_limits(config)
 
 
 def _make_limits(config: DecodeConfig) -> DecodeLimits:

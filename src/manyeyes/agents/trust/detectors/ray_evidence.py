@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from manyeyes.agents.isolation import Quarantine
@@ -21,7 +20,7 @@ from manyeyes.agents.trust.association import Floats
 from manyeyes.agents.trust.beta_trust import BetaTrust, TrustConfig, fusion_weight, update
 from manyeyes.agents.trust.claim_evidence import CheckedClaims, EvidenceConfig, check_claims
 from manyeyes.agents.trust.claim_offset import OffsetConfig, find_offset
-from manyeyes.agents.trust.claim_tracks import ClaimChecks, find_tracks, update_tracks
+from manyeyes.agents.trust.claim_tracks import ClaimChecks, count_refuted_checks, find_tracks, update_tracks
 from manyeyes.agents.trust.copies import CopyConfig, add_contents, find_copies, is_known
 from manyeyes.agents.trust.interface import (
     AssessedClaims,
@@ -46,6 +45,9 @@ from manyeyes.datatypes import Boxes, Message
 
 LOW_TRUST = "low trust"
 NUM_COPY_CHECKS = 5
+# Members of an enumeration are slow to read.
+_SUPPORTED, _CORROBORATED = int(Evidence.SUPPORTED), int(Evidence.CORROBORATED)
+_DISPUTED, _REFUTED = int(Evidence.DISPUTED), int(Evidence.REFUTED)
 
 
 @dataclass(frozen=True)
@@ -98,27 +100,29 @@ class RayEvidenceDetector(MisbehaviourDetector):
     def assess(self, received: MisbehaviourInput, state: object | None) -> Assessment:
         """Assess claims, update trust and exclusions; all before fusion of the same frame."""
         before = state if isinstance(state, TrustState) else TrustState.start(received.frame)
-        now, rotation, shift = advance(before, received.frame, _own_objects(received.own, self.omissions.min_score))
+        detections = _Detections.of(received.own)
+        own = detections.places(self.evidence.min_own_score)
+        now, rotation, shift = advance(before, received.frame, detections.objects(self.omissions.min_score))
         unclaimed = [
             _memory(now, one.agent_id).omitted.follow(
                 find_unclaimed(now.own, one, self.omissions), rotation, shift, 0.0
             )
             for one in received.claims
         ]
-        now, found = self._compare_messages(received, now)
-        checked, omits = self._check(received, now, unclaimed, found)
+        now, found = self._compare_messages(received, own, now)
+        checked, omits = self._check(received, own, now, unclaimed, found)
         checks = [self._follow(one, now) for one in checked]
         now = replace(now, disputes=now.disputes.add(self._find_disputes(checked, checks, now), now.now_ns))
-        checks = [_mark_disputed(check, now.disputes.cover(check.xy)) for check in checks]
+        if len(now.disputes.xy):
+            checks = [_mark_disputed(check, now.disputes.cover(check.xy)) for check in checks]
         num_claims = sum(len(check.xy) for check in checks)
         senders, exclusions, assessments = dict(now.senders), now.exclusions, list[SenderAssessment]()
         for message, check, omitted, is_omitting in zip(received.messages, checks, unclaimed, omits):
             agent_id = message.agent_id
             is_faulty = agent_id in received.faulty or agent_id in found.contradicted
-            memory = self._update_sender(now, message, check, is_omitting, is_faulty or agent_id in found.copied)
-            memory, exclusions = self._decide(
-                agent_id, replace(memory, omitted=omitted), exclusions, now, num_claims, is_faulty
-            )
+            fault = self.trust.omitted * is_omitting
+            memory = self._update_sender(now, message, check, fault, is_faulty or agent_id in found.copied, omitted)
+            memory, exclusions = self._decide(agent_id, memory, exclusions, now, num_claims, is_faulty)
             senders[agent_id] = memory
             is_excluded = exclusions.contains(agent_id, now.now_ns)
             assessments.append(self._assess_sender(agent_id, memory, is_excluded, is_faulty, found))
@@ -137,9 +141,10 @@ class RayEvidenceDetector(MisbehaviourDetector):
             senders[agent_id] = replace(_memory(state, agent_id), trust=trust, updated_ns=state.now_ns)
         return replace(state, senders=senders)
 
-    def _compare_messages(self, received: MisbehaviourInput, now: TrustState) -> tuple[TrustState, _Findings]:
+    def _compare_messages(
+        self, received: MisbehaviourInput, own: Floats, now: TrustState
+    ) -> tuple[TrustState, _Findings]:
         """Return the state with what each message as a whole shows, and that: common offsets of its claims, and copied content."""
-        own = received.own.center[received.own.score >= self.evidence.min_own_score, :2].double().numpy()
         times_ns = [message.timestamp_ns for message in received.messages]
         contents = {agent_id: memory.contents for agent_id, memory in now.senders.items() if memory.contents}
         copied = find_copies(received.claims, times_ns, contents, self.copies)
@@ -147,24 +152,35 @@ class RayEvidenceDetector(MisbehaviourDetector):
         for one, time_ns in zip(received.claims, times_ns):
             memory = _memory(now, one.agent_id)
             is_wrong = find_offset(one.xy, own, one.sender_xy, self.offset).contradicts(self.offset)
-            if is_wrong is not None:
-                memory = replace(memory, contradicted_ns=now.now_ns if is_wrong else NEVER_NS)
-            if memory.contradicted_ns >= now.now_ns - round(self.offset.memory_s * 1e9):
+            contradicted_ns = memory.contradicted_ns if is_wrong is None else now.now_ns if is_wrong else NEVER_NS
+            if contradicted_ns >= now.now_ns - round(self.offset.memory_s * 1e9):
                 contradicted.add(one.agent_id)
+            copies, contents = memory.copies, add_contents(memory.contents, one, time_ns)
             if not is_known(memory.contents, time_ns):
-                checks = (one.agent_id in copied, *memory.copies)[:NUM_COPY_CHECKS]
-                memory = replace(memory, copies=checks, contents=add_contents(memory.contents, one, time_ns))
-            senders[one.agent_id] = replace(memory, trust=now.trust_of(one.agent_id, self.trust), updated_ns=now.now_ns)
+                copies = (one.agent_id in copied, *copies)[:NUM_COPY_CHECKS]
+            trust = now.trust_of(one.agent_id, self.trust)
+            senders[one.agent_id] = replace(
+                memory,
+                trust=trust,
+                updated_ns=now.now_ns,
+                copies=copies,
+                contents=contents,
+                contradicted_ns=contradicted_ns,
+            )
         return replace(now, senders=senders), _Findings(frozenset(contradicted), copied)
 
     def _check(
-        self, received: MisbehaviourInput, now: TrustState, unclaimed: Sequence[OwnObjects], found: _Findings
+        self,
+        received: MisbehaviourInput,
+        own: Floats,
+        now: TrustState,
+        unclaimed: Sequence[OwnObjects],
+        found: _Findings,
     ) -> tuple[tuple[CheckedClaims, ...], list[bool]]:
         """Return the evidence on all claims, and whether each sender omits an object; excluded senders corroborate nothing."""
         excluded = self.excluded(now, received.agent_ids, now.now_ns) | found.unused
         trust = {a: now.trust_of(a, self.trust).mean for a in received.agent_ids if a not in excluded}
         probes = [make_probes(one, c.sender_xy, self.omissions) for one, c in zip(unclaimed, received.claims)]
-        own = received.own.center[received.own.score >= self.evidence.min_own_score, :2].double().numpy()
         checked, rays = check_claims(
             received.frame, own, received.claims, trust, self.evidence, np.concatenate([np.zeros((0, 7)), *probes])
         )
@@ -203,8 +219,10 @@ class RayEvidenceDetector(MisbehaviourDetector):
         """Return places (N, 2) where a trusted third agent contradicts the ego, or the ego's evidence turned."""
         places = [np.zeros((0, 2))]
         for one, check in zip(checked, checks):
-            is_refuted, is_supported = one.kinds == Evidence.REFUTED, one.kinds == Evidence.SUPPORTED
-            disputed, tracks = is_refuted & one.corroborated, _memory(now, one.claims.agent_id).tracks
+            is_refuted, tracks = one.kinds == _REFUTED, _memory(now, one.claims.agent_id).tracks
+            if not is_refuted.any() and not tracks.refuted_ns.any():
+                continue
+            is_supported, disputed = one.kinds == _SUPPORTED, is_refuted & one.corroborated
             if len(tracks):
                 rows = check.track.clip(0)
                 turned = is_refuted & self._is_recent(tracks.supported_ns[rows], now.now_ns)
@@ -217,33 +235,43 @@ class RayEvidenceDetector(MisbehaviourDetector):
         return (time_ns > 0) & (np.abs(now_ns - time_ns) <= self.naming.sign_change_ns)
 
     def _update_sender(
-        self, now: TrustState, message: Message, checks: ClaimChecks, is_omitting: bool, is_faulty: bool
+        self,
+        now: TrustState,
+        message: Message,
+        checks: ClaimChecks,
+        fault: float,
+        is_faulty: bool,
+        omitted: OwnObjects,
     ) -> SenderMemory:
-        """Return the memory of a sender after its claims of this frame; a message that was assessed before adds nothing."""
+        """Return the memory of a sender after its claims of this frame; a message that was assessed before adds nothing.
+
+        fault: beside that of its claims.
+        """
         trust, memory = now.trust_of(message.agent_id, self.trust), _memory(now, message.agent_id)
         if memory.captured_ns == message.timestamp_ns:
-            return replace(memory, trust=trust, updated_ns=now.now_ns)
+            return replace(memory, trust=trust, updated_ns=now.now_ns, omitted=omitted)
         kinds, score = checks.evidence, checks.score
-        is_support = (kinds == Evidence.SUPPORTED) | (kinds == Evidence.CORROBORATED)
-        is_fault = (kinds == Evidence.REFUTED) & (score >= self.naming.min_score)
-        fault = self.trust.refuted * float(score[is_fault].sum()) + self.trust.omitted * is_omitting
+        is_support = (kinds == _SUPPORTED) | (kinds == _CORROBORATED)
+        is_fault = (kinds == _REFUTED) & (score >= self.naming.min_score)
+        fault += self.trust.refuted * float(score[is_fault].sum())
         if not is_faulty:
             trust = update(trust, float(score[is_support].sum()), fault, self.trust)
         tracks = update_tracks(memory.tracks, checks, now.now_ns)
-        return replace(memory, trust=trust, updated_ns=now.now_ns, captured_ns=message.timestamp_ns, tracks=tracks)
+        captured_ns = message.timestamp_ns
+        return replace(
+            memory, trust=trust, updated_ns=now.now_ns, captured_ns=captured_ns, tracks=tracks, omitted=omitted
+        )
 
     def _find_reason(self, memory: SenderMemory, num_claims: int) -> str:
         """Return why a sender is named malicious, or nothing."""
         tracks = memory.tracks
         if sum(memory.copies) >= self.copies.min_copies:
             return f"{sum(memory.copies)} of its last messages were copies of others' content"
-        refuted = tracks.count(Evidence.REFUTED)
-        counts = (tracks.score >= self.naming.min_score) & (tracks.count(Evidence.SUPPORTED) == 0)
-        counts &= tracks.count(Evidence.DISPUTED) == 0
-        needed = self.naming.min_refuted + (num_claims > self.naming.many_claims)
-        if bool((counts & (refuted >= needed)).any()):
-            return f"a claim was refuted in {int(refuted[counts].max())} of its last checks and never supported"
-        num_claims_refuted = int((counts & (refuted >= self.naming.min_refuted_each)).sum())
+        refuted = count_refuted_checks(tracks, self.naming.min_score)
+        needed, most = self.naming.min_refuted + (num_claims > self.naming.many_claims), int(refuted.max(initial=0))
+        if most >= needed:
+            return f"a claim was refuted in {most} of its last checks and never supported"
+        num_claims_refuted = int((refuted >= self.naming.min_refuted_each).sum())
         return f"{num_claims_refuted} claims were refuted repeatedly" if num_claims_refuted >= 2 else ""
 
     def _assess_sender(
@@ -268,13 +296,30 @@ def _memory(state: TrustState, agent_id: int) -> SenderMemory:
     return state.senders.get(agent_id, UNKNOWN_SENDER)
 
 
-def _own_objects(own: Boxes, min_score: float) -> OwnObjects:
-    """Return the detections (K) of the ego of a score, as objects of one frame."""
-    kept = own.score >= min_score
-    columns = torch.cat((own.center[kept], own.size[kept], own.yaw[kept, None]), 1).double().numpy()
-    return OwnObjects(columns, own.velocity[kept].double().numpy(), np.ones(len(columns), np.int64))
+@dataclass(frozen=True)
+class _Detections:
+    """The ego's detections (K): columns (K, 7) centre, size and yaw; velocity (K, 2); score (K,)."""
+
+    columns: Floats
+    velocity: Floats
+    score: Floats
+
+    @classmethod
+    def of(cls, own: Boxes) -> _Detections:
+        columns = [part.double().numpy() for part in (own.center, own.size, own.yaw[:, None])]
+        return cls(np.concatenate(columns, 1), own.velocity.double().numpy(), own.score.double().numpy())
+
+    def places(self, min_score: float) -> Floats:
+        """Return the centres (M, 2) of those of a score."""
+        return np.ascontiguousarray(self.columns[self.score >= min_score, :2])
+
+    def objects(self, min_score: float) -> OwnObjects:
+        """Return those of a score as objects of one frame."""
+        kept = self.score >= min_score
+        columns = self.columns[kept]
+        return OwnObjects(columns, self.velocity[kept], np.ones(len(columns), np.int64))
 
 
 def _mark_disputed(checks: ClaimChecks, is_disputed: NDArray[np.bool_]) -> ClaimChecks:
     """Return checks whose claims at disputed places are disputed, on either side."""
-    return replace(checks, evidence=np.where(is_disputed, np.uint8(Evidence.DISPUTED), checks.evidence))
+    return replace(checks, evidence=np.where(is_disputed, np.uint8(_DISPUTED), checks.evidence))
