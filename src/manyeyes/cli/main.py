@@ -51,6 +51,7 @@ COMMAND_GROUPS = {
         "demo": "run a whole team on this machine, a process for each agent",
         "map": "run a map server on the network: local maps of agents are fused to one map",
         "replay": "compute a recorded run again, and compare bit for bit",
+        "export": "write a recorded run as a file for the viewer Foxglove",
     },
     "keys": {
         "anchor": "make an anchor, the key that all certificates are traced to, and a trust file",

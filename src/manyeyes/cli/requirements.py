@@ -137,6 +137,7 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
         _SHAPELY,
     ),
     "live replay": (_MCAP, _CRYPTOGRAPHY),
+    "live export": (_MCAP, _CRYPTOGRAPHY),
     "keys anchor": (_CRYPTOGRAPHY,),
     "keys issue": (_CRYPTOGRAPHY,),
     "keys pool": (_CRYPTOGRAPHY,),
