@@ -18,7 +18,7 @@ endif
 export PYTHONWARNINGS := ignore:::pip
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help venv demo test test-fast test-nightly probes coverage mutants check wheel wheels format bench clean
+.PHONY: help venv demo test test-fast test-nightly probes coverage mutants check docs wheel wheels format bench clean
 .DEFAULT_GOAL := help
 
 help:
@@ -30,6 +30,7 @@ help:
 	@echo "make coverage      every test, and the fraction of statements that they run, by module"
 	@echo "make mutants       40 mutations of the source, drawn by SEED, each against the tests of its module; lists the survivors"
 	@echo "make check         formatting, lint, types, layers"
+	@echo "make docs          the documentation site in out/site, for a browser without a server; warnings are errors"
 	@echo "make wheel         build the wheel and run demo, pose and map fuse from it in an empty environment"
 	@echo "make wheels        the same for every set of extras and Python version, and the README's install lines; half an hour"
 	@echo "make format        rewrite the sources in the house format"
@@ -71,6 +72,11 @@ check: $(STAMP)
 	@$(BIN)/ruff check --quiet .
 	@$(BIN)/basedpyright
 	@$(BIN)/lint-imports --no-cache
+
+docs: $(STAMP)
+	@$(BIN)/python scripts/reference_pages.py --check
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo "out/site/index.html"
 
 wheel:
 	@PYTHON=$(PYTHON) bash .ci/wheel

@@ -35,7 +35,8 @@ def packages(requirements: list[str]) -> set[str]:
 
 
 CORE = packages(PROJECT["dependencies"])
-GROUPS = ("all", "dev")
+GROUPS = ("all", "dev", "docs")
+"""Extras of no feature: sets of others, and tools of a checkout."""
 EXTRAS = {name: packages(lines) for name, lines in PROJECT["optional-dependencies"].items() if name not in GROUPS}
 
 

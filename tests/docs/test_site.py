@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The documentation site: every page is in its navigation, generated pages are current, it builds, and its search finds answers."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+QUESTIONS = {
+    "gpu": "guides/train.html",
+    "accuracy real data": "benchmarks/real-data.html",
+    "score threshold": "guides/score-threshold.html",
+    "add method": "questions.html",
+    "change architecture": "guides/architecture-of-a-model.html",
+    "training time": "questions.html",
+    "cloud sensor frame": "guides/sensor-frame.html",
+    "bytes network authenticated": "questions.html",
+    "exported columns": "reference/columns.html",
+    "fine-tune": "guides/fine-tune.html",
+}
+"""What a reader types into the search, and the page that answers."""
+RUN_PAGES = (
+    "quickstart", "guides/byte-budget", "guides/score-threshold", "guides/sensor-frame", "guides/correct-poses",
+    "guides/architecture-of-a-model", "guides/map-from-recordings", "guides/map-cluster",
+)  # fmt: skip
+
+
+def load_script(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, ROOT / "scripts" / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+HOOKS = load_script("docs_hooks")
+
+
+class ConfigLoader(yaml.SafeLoader):
+    """Reads mkdocs.yml without its Python objects."""
+
+
+ConfigLoader.add_multi_constructor("tag:yaml.org,2002:python/", lambda loader, suffix, node: suffix)
+CONFIG: dict[str, Any] = yaml.load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"), ConfigLoader)
+
+
+def list_pages(entry: Any) -> Iterator[str]:
+    if isinstance(entry, str):
+        yield entry
+    for part in entry.values() if isinstance(entry, dict) else entry if isinstance(entry, list) else ():
+        yield from list_pages(part)
+
+
+def test_every_page_is_in_the_navigation_once() -> None:
+    listed = sorted(list_pages(CONFIG["nav"]))
+    outside = [page for name, page in HOOKS.OUTSIDE.items() if page != "index.md" and (ROOT / name).is_file()]
+    assert listed == sorted([*(str(path.relative_to(DOCS)) for path in DOCS.rglob("*.md")), *outside])
+
+
+def test_warnings_are_errors_and_pages_open_without_a_server() -> None:
+    assert CONFIG["strict"] is True and CONFIG["use_directory_urls"] is False and "offline" in CONFIG["plugins"]
+    assert {*CONFIG["validation"]["nav"].values(), *CONFIG["validation"]["links"].values()} == {"warn"}
+    assert all((DOCS / path).is_file() for path in (*CONFIG["extra"]["polyfills"], *CONFIG["extra_css"]))
+
+
+@pytest.mark.slow
+def test_reference_pages_are_those_that_the_code_generates() -> None:
+    pages = load_script("reference_pages").make_pages()
+    stored = {
+        str(path.relative_to(DOCS / "reference")): path.read_text(encoding="utf-8")
+        for path in (DOCS / "reference").rglob("*.md")
+        if "written by scripts/reference_pages.py" in path.read_text(encoding="utf-8")
+    }
+    assert sorted(pages) == sorted(stored)
+    assert [name for name, text in pages.items() if stored[name] != text] == [], "run scripts/reference_pages.py"
+
+
+def test_links_that_leave_the_folder_become_pages_or_names() -> None:
+    from pathlib import PurePosixPath
+
+    text = "[a](../../README.md#install) [b](../../benchmarks/results/x.json) [c](own-data.md) [`x.py`](../../examples/x.py)"
+    assert HOOKS.redirect_links(text, PurePosixPath("guides")) == (
+        "[a](../index.md) b (`benchmarks/results/x.json`) [c](own-data.md) `x.py`"
+    )
+    assert HOOKS.move_links("[a](docs/messages.md) [b](https://x.org)", PurePosixPath("development")) == (
+        "[a](../messages.md) [b](https://x.org)"
+    )
+
+
+def test_lists_and_tables_after_a_paragraph_get_an_empty_line() -> None:
+    text = "A:\n- one\n- two\n  more\nB\n| a |\n|---|\n```\nx\n- y\n```"
+    assert HOOKS.separate_blocks(text) == ("A:\n\n- one\n- two\n  more\nB\n\n| a |\n|---|\n```\nx\n- y\n```")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", RUN_PAGES)
+def test_the_python_of_a_page_runs(page: str) -> None:
+    text = (DOCS / f"{page}.md").read_text(encoding="utf-8")
+    if "simulate" in text:
+        pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
+    blocks = re.findall(r"^```python\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    assert blocks
+    namespace: dict[str, Any] = {}
+    for block in blocks:
+        exec(compile(block, f"{page}.md", "exec"), namespace)
+
+
+def rank_pages(sections: list[dict[str, str]], query: str) -> list[str]:
+    """Rank pages by their best section that has all terms: titles first, then how densely the text has them."""
+    best: dict[str, float] = {}
+    for section in sections:
+        title = section["title"].lower()
+        text = re.sub(r"<[^>]+>", " ", section["text"]).lower()
+        counts = [
+            (len(re.findall(rf"\b{re.escape(t)}", title)), len(re.findall(rf"\b{re.escape(t)}", text)))
+            for t in query.split()
+        ]
+        if all(map(any, counts)):
+            density = sum(of_text for _, of_text in counts) / (50 + len(text.split()))
+            score = 2 * sum(min(of_title, 1) for of_title, _ in counts) - len(title.split()) / 20 + density
+            page = section["location"].partition("#")[0]
+            best[page] = max(score, best.get(page, score))
+    return sorted(best, key=lambda page: -best[page])
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("material", reason="the 'docs' extra is not installed")
+    pytest.importorskip("mkdocstrings", reason="the 'docs' extra is not installed")
+    folder = tmp_path_factory.mktemp("site")
+    words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+@pytest.mark.slow
+def test_the_site_builds_and_asks_no_other_machine(site: Path) -> None:
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > len(list(DOCS.rglob("*.md")))
+    loaded = [
+        url
+        for page in pages
+        for url in re.findall(
+            r"<(?:script|img|link rel=\"stylesheet\")[^>]*(?:src|href)=\"(https?:[^\"]+)", page.read_text()
+        )
+    ]
+    assert loaded == []
+    assert "ap_summaries" not in (site / "index.html").read_text() and (site / "search" / "search_index.js").is_file()
+    agent = (site / "reference" / "api" / "agents.html").read_text()
+    assert 'id="manyeyes.agents.agent.Agent"' in agent and "Agent.perceive" in agent
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("query", "page"), QUESTIONS.items(), ids=QUESTIONS)
+def test_the_search_finds_the_page_that_answers(site: Path, query: str, page: str) -> None:
+    sections = json.loads((site / "search" / "search_index.json").read_text())["docs"]
+    assert page in rank_pages(sections, query)[:3]
