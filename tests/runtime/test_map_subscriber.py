@@ -20,6 +20,7 @@ from manyeyes.agents.map_perception import rectangle
 from manyeyes.agents.map_server import MapServer
 from manyeyes.agents.periodic_map import PeriodicMapPredictor
 from manyeyes.agents.strategies.registry import get_strategy
+from manyeyes.cli.live import map as live_map
 from manyeyes.comms.network.interface import Network, Origin, ReceivedPacket
 from manyeyes.comms.network.tiles import NetworkTile
 from manyeyes.comms.signatures.certificate import SENDER_RIGHTS
@@ -218,6 +219,14 @@ def test_messages_that_waited_in_the_network_are_all_ingested(federation: Federa
     for number in range(10):
         receiver.wire.put(sign(receiver.signer, receiver.share(number)), START_NS + number * TENTH_NS + MS)
     assert receiver.send([], 10) == 10 and receiver.subscriber.server.num_incomplete == 0
+
+
+def test_what_arrived_while_the_server_was_busy_is_received_after_it_was_stopped(federation, monkeypatch) -> None:
+    monkeypatch.setattr(live_map.signal, "signal", lambda *_: None)
+    receiver = Receiver(federation)
+    receiver.wire.put(sign(receiver.signer, receiver.share(0)), START_NS + MS)
+    live_map._receive(receiver.subscriber, 0.0)
+    assert len(receiver.subscriber.server.observations) == 1
 
 
 def test_a_map_is_sent_once_a_period() -> None:

@@ -63,7 +63,7 @@ def main(options: Options) -> None:
 
 
 def _compile_fusion() -> None:
-    """Fuse two local maps of a line: compiled later, it would take longer than packets wait."""
+    """Fuse two local maps of each kind of element: compiled later, it would take longer than packets wait."""
     import torch
 
     from manyeyes.agents.map_perception import rectangle
@@ -75,7 +75,10 @@ def _compile_fusion() -> None:
 
     server, view = MapServer(), rectangle((0.0, -15.0, 30.0, 15.0))
     for agent_id in (1, 2):
-        lines = MapElements.of([[[0.0, 0.1 * agent_id], [30.0, 0.0]]], [KINDS.index("divider")], 0.9)
+        y = 0.1 * agent_id
+        ring = [[5.0, y], [8.0, y], [8.0, y + 6.0], [5.0, y + 6.0]]
+        shapes = [ring if kind == "crossing" else [[0.0, y], [15.0, y], [30.0, 0.0]] for kind in KINDS]
+        lines = MapElements.of(shapes, list(range(len(KINDS))), 0.9)
         header = Message(agent_id, 0, Transform.identity(), torch.zeros(3, 3).double(), local_map=LocalMap(lines, view))
         server.ingest_message(ReceivedMessage(header, 1, 1, None))
     server.rebuild()
@@ -90,6 +93,8 @@ def _receive(subscriber: MapSubscriber, seconds: float | None) -> None:
     while not stopped.wait(POLL_S) and polls != 0:
         subscriber.poll()
         polls = None if polls is None else polls - 1
+    # What arrived while it fused.
+    subscriber.poll()
 
 
 def _write(subscriber: MapSubscriber, out: Path) -> str:
