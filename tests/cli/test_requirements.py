@@ -106,6 +106,8 @@ CASES = [
     ("live map --transport udp", "pyarrow", "live map needs the 'map' extra"),
     ("live demo", "zenoh", "live demo needs the 'live' extra"),
     ("live replay r.mcap", "mcap", "live replay needs the 'live' extra"),
+    ("live export r.mcap", "mcap", "live export needs the 'live' extra"),
+    ("live export r.mcap", "cryptography", "live export needs the 'live' extra"),
     ("keys anchor", "cryptography", "keys anchor needs the 'live' extra: pip install 'manyeyes[live]'"),
     ("keys issue a", "cryptography", "keys issue needs the 'live' extra"),
     ("keys pool --out p", "cryptography", "keys pool needs the 'live' extra"),
