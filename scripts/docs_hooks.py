@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hooks of MkDocs: pages that lie outside docs, links that leave it, and Markdown that GitHub reads and Python-Markdown does not."""
+"""Hooks of MkDocs: pages outside docs, links that leave it, and Markdown that GitHub reads and Python-Markdown does not."""
 
 from __future__ import annotations
 

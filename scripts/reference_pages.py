@@ -126,13 +126,13 @@ def describe_protocol(protocol: Any) -> str:
 
 def make_presets() -> str:
     """Make the page of presets: every name that an option takes."""
-    names: Mapping[str, Sequence[str]] = {
-        "Strategies (`--methods`)": list_strategies(),
-        "Fusion modules (`--fusion`)": list_fusion_modules(),
-        "Detectors that ship (`--weights`)": list_detectors(),
-        "Methods of map fusion (`--method`)": list_map_fusions(),
-        "Policies of a simulated fleet (`map simulate --crowd`)": tuple(CROWDS),
-        "Places of a simulated fleet (`map simulate PLACE`)": tuple(PLACES),
+    names: Mapping[tuple[str, str], Sequence[str]] = {
+        ("Strategies", "--methods"): list_strategies(),
+        ("Fusion modules", "--fusion"): list_fusion_modules(),
+        ("Detectors that ship", "--weights"): list_detectors(),
+        ("Methods of map fusion", "--method"): list_map_fusions(),
+        ("Policies of a simulated fleet", "map simulate --crowd"): tuple(CROWDS),
+        ("Places of a simulated fleet", "map simulate PLACE"): tuple(PLACES),
     }
     simulation = format_table(
         ("preset", "scenes by split (towns)", "frames", "LiDAR"),
@@ -165,12 +165,15 @@ def make_presets() -> str:
     )
     parts = [
         f"# Presets\n\n{GENERATED}\n\nEvery name that an option of the command line takes.\n",
-        f"## Recordings (`manyeyes simulate --preset`)\n\n{simulation}\n",
-        f"## Plans of training (`manyeyes train --preset`)\n\n{plans}\n\nA stage is a preset, too: `costr-small/stage1`.\n",
+        f"## Recordings\n\n`manyeyes simulate --preset`\n\n{simulation}\n",
+        f"## Plans of training\n\n`manyeyes train --preset`; a stage is a preset, too: `costr-small/stage1`.\n\n{plans}\n",
         f"## Presets of training\n\n{training}\n",
-        f"## Channels (`--channel`)\n\n{channels}\n",
-        f"## Protocols (`--protocol`)\n\n{protocols}\n",
-        *(f"## {title}\n\n{', '.join(f'`{name}`' for name in sorted(listed))}\n" for title, listed in names.items()),
+        f"## Channels\n\n`--channel`\n\n{channels}\n",
+        f"## Protocols\n\n`--protocol`\n\n{protocols}\n",
+        *(
+            f"## {title}\n\n`{option}`: {', '.join(f'`{name}`' for name in sorted(listed))}\n"
+            for (title, option), listed in names.items()
+        ),
     ]
     return "\n".join(parts)
 
@@ -200,8 +203,7 @@ def make_api_pages() -> dict[str, str]:
     }
     rows = []
     for name, definition in sorted(top.items(), key=lambda item: item[0].lower()):
-        package, path = definition.module.split(".")[1], f"{definition.module}.{definition.name}"
-        rows.append((f"[`{name}`]({package}.md#{path})", f"`{definition.module}`"))
+        rows.append((f"[`{name}`]({definition.module.split('.')[1]}.md)", f"`{definition.module}`"))
     table = format_table(("name", "module"), rows)
     about = (
         "Names that `import manyeyes` gives, in metres, radians and nanoseconds ([conventions](../../conventions.md))."

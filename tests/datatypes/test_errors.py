@@ -30,3 +30,8 @@ def _raise() -> None:
 def test_worker_raises_missing_extra() -> None:
     with ProcessPoolExecutor(1) as pool, pytest.raises(MissingExtraError, match="traffic needs the 'sim' extra"):
         pool.submit(_raise).result(timeout=60)
+
+
+def test_a_missing_extra_names_the_line_for_a_checkout_too() -> None:
+    text = str(MissingExtraError("sim,view", "demo"))
+    assert "pip install 'manyeyes[sim,view]'" in text and "in a checkout: pip install -e '.[sim,view]'" in text

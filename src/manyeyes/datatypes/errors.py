@@ -48,7 +48,8 @@ class MissingExtraError(ManyeyesError, ImportError):
     def __init__(self, extra: str, purpose: str) -> None:
         names = " and ".join(f"'{name}'" for name in extra.split(","))
         noun = "extras" if "," in extra else "extra"
-        super().__init__(f"{purpose} needs the {names} {noun}: pip install 'manyeyes[{extra}]'")
+        line = f"pip install 'manyeyes[{extra}]' (in a checkout: pip install -e '.[{extra}]')"
+        super().__init__(f"{purpose} needs the {names} {noun}: {line}")
         self._arguments = extra, purpose
 
     def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str]]:
