@@ -33,7 +33,7 @@ QUESTIONS = {
 """What a reader types into the search, and the page that answers."""
 RUN_PAGES = (
     "quickstart", "guides/byte-budget", "guides/score-threshold", "guides/sensor-frame", "guides/correct-poses",
-    "guides/architecture-of-a-model", "guides/map-from-recordings", "guides/map-cluster",
+    "guides/architecture-of-a-model", "guides/map-cluster",
 )  # fmt: skip
 
 
