@@ -226,7 +226,9 @@ def check_command(check: Check, extras: str, folder: Path, env: dict[str, str], 
         tail = "\n".join(output.splitlines()[-25:])
         print(f"{' '.join(words)}: exit code {done.returncode}, missing {lacking}\n{tail}", file=sys.stderr, flush=True)
         return f"FAILED: exit code {done.returncode}"
-    expected = f"manyeyes: {check.name} needs the {check.refusal[0]}: pip install 'manyeyes[{check.refusal[1]}]'"
+    names, extra = check.refusal
+    line = f"pip install 'manyeyes[{extra}]' (in a checkout: pip install -e '.[{extra}]')"
+    expected = f"manyeyes: {check.name} needs the {names}: {line}"
     if done.returncode == 1 and output == expected and not any(folder.iterdir()):
         return "refused"
     print(f"{' '.join(words)}: expected the refusal\n{expected}\ngot\n{output[-2000:]}", file=sys.stderr, flush=True)
