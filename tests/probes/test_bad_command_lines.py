@@ -213,6 +213,8 @@ study main-table --data {missing} | {missing}
 live run {missing} | {missing}
 live replay {missing} | {missing}
 live replay {text} | no whole recording
+live export {missing} | {missing}
+live export {text} | no whole recording
 keys issue stem --issuer {missing} | {missing}
 keys revoke {text} | no certificate
 keys trust {missing} | {missing}
