@@ -109,7 +109,8 @@ def _encode_in_loops(tokens: Tensor, tables: CentreTables) -> Tensor:
     """Encode tokens (N, C + PROPOSAL_DIM) to codes (N, W) uint8, on the CPU."""
     stages, _, channels = tables.centres.shape
     tokens = tokens.detach()
-    proposal, codes = tokens[:, channels:], torch.empty(len(tokens), stages + PROPOSAL_CODES, dtype=torch.uint8)
+    proposal = tokens[:, channels:]
+    codes = torch.empty(len(tokens), stages + PROPOSAL_CODES, dtype=torch.uint8, device=tokens.device)
     # The arc tangent by the reference itself, so that yaws between two codes fall on the same side.
     yaw, rows, out = axis_yaw(proposal[:, BOX_LAYOUT.axis]).numpy(), tokens.contiguous().numpy(), codes.numpy()
     features = np.empty((len(rows), stages), np.uint8)
