@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import multiprocessing
+import pickle
 import re
 import time
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from typing import Any
 
+import numba
 import pytest
 
 import manyeyes
@@ -43,6 +45,27 @@ def test_two_processes_keep_both_variants(tmp_path: Path) -> None:
         assert process.exitcode == 0
     index = _LockedIndexFile(str(tmp_path), "loop", "stamp")
     assert [index.load(key) for key in ("one", "two", "three")] == ["the code of one", "the code of two", None]
+
+
+@pytest.mark.parametrize("damage", ["gone", "module", "cut", "garbage"])
+def test_an_index_that_cannot_be_read_is_compiled_anew(tmp_path: Path, damage: str) -> None:
+    """After an upgrade in place, an index may name classes of the code before."""
+    index = _LockedIndexFile(str(tmp_path), "loop", "stamp")
+    index.save("one", "its code")
+    assert index.load("one") == "its code"
+    path = tmp_path / "loop.nbi"
+    head = pickle.dumps(numba.__version__)
+    path.write_bytes(
+        {
+            "gone": head + b"cmanyeyes._jit\nGone\n.",
+            "module": head + b"cmanyeyes.gone\nGone\n.",
+            "cut": path.read_bytes()[:-5],
+            "garbage": head + b"\xff\xff",
+        }[damage]
+    )
+    assert index.load("one") is None
+    index.save("one", "its new code")
+    assert index.load("one") == "its new code"
 
 
 def test_loops_are_kept_so() -> None:

@@ -8,6 +8,7 @@ processes. Every compiled loop of the package takes njit from here.
 
 from __future__ import annotations
 
+import pickle
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,13 @@ class _LockedIndexFile(caching.IndexDataCacheFile):
     def save(self, key: Any, data: Any) -> None:
         with self._lock():
             super().save(key, data)
+
+    def _load_index(self) -> Any:
+        """Return the variants; none where the index is damaged or names classes of other code, so that they are compiled anew."""
+        try:
+            return super()._load_index()
+        except (AttributeError, ImportError, EOFError, pickle.UnpicklingError):
+            return {}
 
     def _lock(self) -> FileLock:
         return FileLock(f"{self._index_path}.lock")
