@@ -36,12 +36,14 @@ def source_digest(*modules: str, package: Path = PACKAGE) -> str:
 def import_closure(*modules: str, package: Path = PACKAGE) -> list[Path]:
     """Return the files that run when these modules, and all that they import of the package, are used; sorted."""
     found: set[Path] = set()
+    resolved: set[str] = set()
     left = [file for module in modules for file in _files_of(module, package, required=True)]
     while left:
         file = left.pop()
         if file not in found:
             found.add(file)
-            names = _parse(file.read_text(encoding="utf-8")).imports
+            names = set(_parse(file.read_text(encoding="utf-8")).imports) - resolved
+            resolved |= names
             left += [other for name in names for other in _files_of(name, package)]
     return sorted(found)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pairs of boxes of a real log: who is paired with whom, frames, and correction in real traffic."""
+"""Pairs of boxes of a real log: pairs, frames, and correction in real traffic."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ class UpWeights(NamedTuple):
     bias: F32x1
 
 
-class Lattice(NamedTuple):
+class BatchLattice(NamedTuple):
     """Rows and columns of each grid of a batch, and their number."""
 
     rows: int
@@ -59,22 +59,24 @@ class Level(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _coarser(fine: Lattice) -> Lattice:  # pragma: no cover
+def _coarser(fine: BatchLattice) -> BatchLattice:  # pragma: no cover
     """Return the lattice at twice the stride."""
-    return Lattice(-(-fine.rows // 2), -(-fine.columns // 2), fine.batch_size)
+    return BatchLattice(-(-fine.rows // 2), -(-fine.columns // 2), fine.batch_size)
 
 
 @njit(cache=True, nogil=True)
-def _meet_same(key: I64x1, lattice: Lattice) -> Pairs:  # pragma: no cover
-    """Return the pairs of a 3x3 kernel on one set of sites: of the taps before the middle, the others are theirs turned round."""
+def _meet_same(key: I64x1, lattice: BatchLattice) -> Pairs:  # pragma: no cover
+    """Return the pairs of a 3x3 kernel on one set of sites, of the four taps before the middle; those after it are the same pairs
+    with source and target exchanged.
+    """
     shape = (lattice.rows, lattice.columns)
     bordered = BorderedImages(lattice.batch_size, lattice.rows + 2, lattice.columns + 2)
     return collect_pairs(key, key, shape, shape, bordered, _SAME, 4)
 
 
 @njit(cache=True, nogil=True)
-def _meet_coarser(coarse: I64x1, key: I64x1, fine: Lattice) -> Pairs:  # pragma: no cover
-    """Return what coarser sites meet among finer ones by a 3x3 kernel of stride 2."""
+def _meet_coarser(coarse: I64x1, key: I64x1, fine: BatchLattice) -> Pairs:  # pragma: no cover
+    """Return the pairs of coarser sites with the finer ones below a 3x3 kernel of stride 2."""
     half = _coarser(fine)
     bordered = BorderedImages(
         fine.batch_size, 1 + max(fine.rows, 2 * half.rows), 1 + max(fine.columns, 2 * half.columns)
@@ -94,7 +96,7 @@ def apply_pointwise(level: Level, weights: ConvWeights) -> Level:  # pragma: no 
 
 
 @njit(cache=True, nogil=True)
-def apply_stage(level: Level, lattice: Lattice, weights: ConvWeights) -> Level:  # pragma: no cover
+def apply_stage(level: Level, lattice: BatchLattice, weights: ConvWeights) -> Level:  # pragma: no cover
     """Apply submanifold layers of kernel 3."""
     pairs = _meet_same(level.key, lattice)
     features = apply_layers(level.features, weights.weight, weights.bias, pairs, True, level.key.shape[0])
@@ -102,7 +104,7 @@ def apply_stage(level: Level, lattice: Lattice, weights: ConvWeights) -> Level: 
 
 
 @njit(cache=True, nogil=True)
-def apply_down(level: Level, lattice: Lattice, weights: ConvWeights) -> Level:  # pragma: no cover
+def apply_down(level: Level, lattice: BatchLattice, weights: ConvWeights) -> Level:  # pragma: no cover
     """Apply a convolution of kernel 3 and stride 2, to the parents of the occupied cells of a lattice."""
     half = _coarser(lattice)
     coarse = collect_parents(level.key, lattice.rows, lattice.columns, lattice.batch_size, half.rows, half.columns, 2)
@@ -112,7 +114,7 @@ def apply_down(level: Level, lattice: Lattice, weights: ConvWeights) -> Level:  
 
 
 @njit(cache=True, nogil=True)
-def apply_up(coarse: Level, fine: Level, lattice: Lattice, weights: UpWeights) -> Level:  # pragma: no cover
+def apply_up(coarse: Level, fine: Level, lattice: BatchLattice, weights: UpWeights) -> Level:  # pragma: no cover
     """Apply an inverse convolution to the cells of a finer level, which has the lattice, added to its lateral layer."""
     pairs = _meet_coarser(coarse.key, fine.key, lattice)
     turned = Pairs(pairs.target, pairs.source, pairs.counts)
@@ -122,7 +124,7 @@ def apply_up(coarse: Level, fine: Level, lattice: Lattice, weights: UpWeights) -
 
 
 @njit(cache=True, nogil=True)
-def merge_levels(fine: Level, coarse: Level, coarsest: Level, lattice: Lattice) -> Level:  # pragma: no cover
+def merge_levels(fine: Level, coarse: Level, coarsest: Level, lattice: BatchLattice) -> Level:  # pragma: no cover
     """Return the sums of three levels, each of twice the stride of the one before, on the cells of the first's lattice."""
     half = _coarser(lattice)
     quarter = _coarser(half)

@@ -19,7 +19,7 @@ def add_checks(
     """Return the checks and times of the tracks of N claims, then of those that are left, and the rows of the latter among the K.
 
     checks (K, NUM_CHECKS), times_ns (K,) claimed, supported, refuted: of the tracks before. track, evidence: (N,) of claims.
-    numbers: the time now, the longest without a claim, the most tracks, and the values of SUPPORTED and REFUTED.
+    numbers: the time now, the maximum time without a claim, the maximum number of tracks, and the values of SUPPORTED and REFUTED.
     """
     claimed_ns, supported_ns, refuted_ns = times_ns
     now_ns, max_unclaimed_ns, max_tracks, is_supported, is_refuted = numbers

@@ -88,21 +88,21 @@ def encode_features(features: F32x2, tables: CentreTables, out: U8x2) -> None:  
         products[:] = np.float32(0)
         add_products(rest, tables.panels[s], 0, 1, rows, rows, counts, products)
         for i in range(n):
-            code = _find_least(products[i], tables.squares[s])
+            code = _find_nearest(products[i], tables.squares[s])
             out[i, s] = code
             for c in range(channels):
                 rest[i, c] -= tables.centres[s, code, c]
 
 
 @njit(cache=True, nogil=True)
-def _find_least(products: F32x1, squares: F32x1) -> int:  # pragma: no cover
-    """Return the first column with the least square - 2 * product; products are overwritten."""
-    least = np.float32(np.inf)
+def _find_nearest(products: F32x1, squares: F32x1) -> int:  # pragma: no cover
+    """Return the first column with the minimum of square - 2 * product; products are overwritten."""
+    minimum = np.float32(np.inf)
     for k in range(np.uintp(products.shape[0])):
         products[k] = squares[k] - np.float32(2) * products[k]
-        least = min(least, products[k])
+        minimum = min(minimum, products[k])
     for k in range(products.shape[0]):
-        if products[k] == least:
+        if products[k] == minimum:
             return k
     return 0
 

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from manyeyes.datatypes import BevGrid, Sites, SparseBev
 from manyeyes.models.detector.pruning import FocalPrune, PruneOutput
 from manyeyes.ops._level_kernels import (
+    BatchLattice,
     ConvWeights,
-    Lattice,
     Level,
     UpWeights,
     apply_down,
@@ -94,13 +94,13 @@ class FoldedEncoder:
         """Encode pillars (N, C) to tokens; also the pruning decisions, and the number of sites at each stride."""
         batch_size, threshold = x.sites.batch_size, np.float32(prune_threshold)
         level = apply_pointwise(Level(x.sites.key.numpy(), x.features.contiguous().numpy()), self.first)
-        levels, lattices, grids = dict[int, Level](), dict[int, Lattice](), dict[int, BevGrid]()
+        levels, lattices, grids = dict[int, Level](), dict[int, BatchLattice](), dict[int, BevGrid]()
         pruned = list[PruneOutput]()
         for number, stride in enumerate(self.strides):
             if number:
                 level = apply_down(level, lattices[stride // 2], self.downs[number - 1])
             grids[stride] = x.grid.at(stride)
-            lattices[stride] = Lattice(*grids[stride].shape, batch_size)
+            lattices[stride] = BatchLattice(*grids[stride].shape, batch_size)
             stage = self.stages[number]
             level = level if stage is None else apply_stage(level, lattices[stride], stage)
             if stride in self.prunes:

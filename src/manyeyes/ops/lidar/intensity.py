@@ -85,7 +85,8 @@ def compute_intensity(
     Returns:
         (N,) float32 in [0, 1].
     """
-    # In float64: libraries round exponentials and powers of float32 by processor, and recordings are the same bytes on all of them.
+    # In float64, rounded at the end: in float32, exponentials and powers of torch differ in the last bit between processors, and
+    # recordings would too.
     attenuation = torch.exp(-ATTENUATION_PER_M * range_m.double())
     material = reflectivity * attenuation
     if law.kind == "material":

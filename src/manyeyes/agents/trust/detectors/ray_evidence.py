@@ -268,9 +268,10 @@ class RayEvidenceDetector(MisbehaviourDetector):
         if sum(memory.copies) >= self.copies.min_copies:
             return f"{sum(memory.copies)} of its last messages were copies of others' content"
         refuted = count_refuted_checks(tracks, self.naming.min_score)
-        needed, most = self.naming.min_refuted + (num_claims > self.naming.many_claims), int(refuted.max(initial=0))
-        if most >= needed:
-            return f"a claim was refuted in {most} of its last checks and never supported"
+        needed = self.naming.min_refuted + (num_claims > self.naming.many_claims)
+        max_refuted = int(refuted.max(initial=0))
+        if max_refuted >= needed:
+            return f"a claim was refuted in {max_refuted} of its last checks and never supported"
         num_claims_refuted = int((refuted >= self.naming.min_refuted_each).sum())
         return f"{num_claims_refuted} claims were refuted repeatedly" if num_claims_refuted >= 2 else ""
 
