@@ -17,6 +17,9 @@ OUTSIDE = {
 """Documents outside docs, and the pages that hold their content in the site."""
 _FENCE = re.compile(r"^ *(```|~~~)")
 _ITEM = re.compile(r"^ *(?:[-*]|\d+\.) ")
+_PICTURE = re.compile(
+    r'<picture><source media="\(prefers-color-scheme: dark\)" srcset="([^"]+)"><img alt="([^"]*)" src="([^"]+)"></picture>'
+)
 _LINK = re.compile(r"(?<!!)\[([^\]\[]*(?:\[[^\]]*\][^\]\[]*)*)\]\(([^)\s]+)\)")
 
 
@@ -33,7 +36,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
     """Adapt one page of the repository to the site."""
-    return separate_blocks(redirect_links(markdown, PurePosixPath(page.file.src_uri).parent))
+    return separate_blocks(split_pictures(redirect_links(markdown, PurePosixPath(page.file.src_uri).parent)))
 
 
 def move_links(text: str, folder: PurePosixPath) -> str:
@@ -65,6 +68,14 @@ def redirect_links(text: str, folder: PurePosixPath) -> str:
         return label if PurePosixPath(path).name in label else f"{label} (`{path}`)"
 
     return _LINK.sub(redirect, text)
+
+
+def split_pictures(text: str) -> str:
+    """Replace pictures with a light and a dark form by two images, of which the site shows the one of its own theme."""
+    return _PICTURE.sub(
+        r'<p><img alt="\2" src="\3#only-light"><img alt="\2" src="\1#only-dark"></p>',
+        text,
+    )
 
 
 def separate_blocks(text: str) -> str:

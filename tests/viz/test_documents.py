@@ -101,7 +101,7 @@ def root(tmp_path: Path) -> Path:
 def test_tables_are_written_once_between_their_markers(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page = root / "docs" / "p.md"
     assert main(["report", "docs", "--root", str(root), "--check"]) == 1
-    assert "p.md: tables differ" in capsys.readouterr().err and END in page.read_text()
+    assert "p.md: differs from" in capsys.readouterr().err and END in page.read_text()
     assert main(["report", "docs", "--root", str(root)]) == 0
     text = re.sub(" +", " ", page.read_text())
     assert text.startswith("# Page\n\nText.\n\n<!-- report: all -->\n\n**Methods**") and text.endswith(

@@ -96,7 +96,7 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
     "view": (_PILLOW, Requirement("rerun", EXTRAS["rerun"]).when("rerun", "*")),
     "pose": (_GICP,),
     "doctor": (),
-    "report docs": (),
+    "report docs": (_MATPLOTLIB,),
     "report check-cells": (),
     "map build": (_ARROW, _SHAPELY, _MATPLOTLIB),
     "map simulate": (_ARROW, _SHAPELY),

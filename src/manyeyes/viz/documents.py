@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of stored results in Markdown documents, between two markers.
+"""Tables and figures of stored results in Markdown documents, between two markers.
 
 A marker is a comment on a line of its own, the table stands below it, and ``<!-- end of report -->`` ends it. Paths are below
 ``benchmarks/results``:
@@ -8,7 +8,8 @@ A marker is a comment on a line of its own, the table stands below it, and ``<!-
 - ``<!-- report: FILE.json TABLE ... -->``: some of its tables, by name (``methods``, ``operating-point``, ``differences``, ...);
 - ``<!-- report: seeds STRATEGY NAME=FILE.json,FILE.json NAME=... -->``: methods that were trained from several seeds;
   differences are those of the first to the others;
-- ``<!-- report: picture FILE.png TEXT -->``: a picture that a study drew, with its text.
+- ``<!-- report: picture FILE.png TEXT -->``: a picture that a study drew, with its text;
+- ``<!-- report: figure NAME FILE.json ... -->``: a figure drawn from files of results, light and dark, in docs/images/plots.
 
 Below the tables of a file stands where its numbers come from. What is not stored yet reads "not run".
 """
@@ -22,10 +23,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from manyeyes.datatypes import ConfigError
+from manyeyes.viz.figure_svg import THEMES
+from manyeyes.viz.stored_figures import FIGURES, draw_figure
 from manyeyes.viz.stored_tables import StoredTable, load_result, make_seed_tables, make_tables
 from manyeyes.viz.table import NOT_RUN, format_markdown_lines
 
 RESULTS = Path("benchmarks/results")
+PLOTS = Path("docs/images/plots")
 END = "<!-- end of report -->"
 _BEGIN = re.compile(r"^<!-- report: (.+?) -->$", re.M)
 _FOLDERS = ("docs", "src", "examples", "benchmarks")
@@ -33,7 +37,10 @@ _FOLDERS = ("docs", "src", "examples", "benchmarks")
 
 @dataclass(frozen=True)
 class Document:
-    """A Markdown file with tables of stored results. text: as it is; updated: with the tables of its results."""
+    """A file made from stored results: Markdown with their tables, or a figure as SVG.
+
+    text: as it is, empty where the file does not exist; updated: as its results make it.
+    """
 
     path: Path
     text: str
@@ -41,18 +48,36 @@ class Document:
 
 
 def find_documents(root: Path) -> tuple[Document, ...]:
-    """Read all documents of a repository that have a marker, and make their tables.
+    """Read all documents of a repository that have a marker, and make their tables, then the figures that they show.
 
     Raises:
         ConfigError: a marker or its results are not valid; the text names the document or the file of results.
     """
     paths = [*sorted(root.glob("*.md")), *(p for f in _FOLDERS for p in sorted((root / f).rglob("*.md")))]
-    texts = ((path, path.read_text(encoding="utf-8")) for path in paths)
-    return tuple(
-        Document(path, text, update_text(text, root / RESULTS, str(path.relative_to(root))))
-        for path, text in texts
-        if _BEGIN.search(text)
-    )
+    texts = [(path, text) for path in paths if _BEGIN.search(text := path.read_text(encoding="utf-8"))]
+    documents = [
+        Document(path, text, update_text(text, root / RESULTS, str(path.relative_to(root)))) for path, text in texts
+    ]
+    markers = [marker.group(1).split() for _, text in texts for marker in _BEGIN.finditer(text)]
+    figures = dict.fromkeys(tuple(words[1:]) for words in markers if words[0] == "figure")
+    return (*documents, *(document for words in figures for document in _draw_documents(words, root)))
+
+
+def _draw_documents(words: Sequence[str], root: Path) -> Iterator[Document]:
+    """Yield the two files of one figure, where all of its results are stored."""
+    files = [root / RESULTS / name for name in words[1:]]
+    if not all(file.is_file() for file in files):
+        return
+    results = [load_result(file) for file in files]
+    for theme in THEMES:
+        path = root / PLOTS / _name_figure(words, theme.name)
+        text = path.read_text(encoding="utf-8") if path.is_file() else ""
+        yield Document(path, text, draw_figure(words[0], results, theme))
+
+
+def _name_figure(words: Sequence[str], theme: str) -> str:
+    """Name the file of a figure: the figure, the first of its results if there are figures of others, and the theme."""
+    return f"{words[0]}-{Path(words[1]).stem.replace('_', '-')}-{theme}.svg"
 
 
 def update_text(text: str, results: Path, name: str) -> str:
@@ -76,6 +101,9 @@ def _make_parts(words: Sequence[str], results: Path, name: str) -> Iterator[str]
         return
     if words[0] == "picture":
         yield _make_picture(words[1:], results, name)
+        return
+    if words[0] == "figure":
+        yield from _make_figure(words[1:], results, name)
         return
     path = results / words[0]
     files = sorted(path.glob("*.json")) if path.is_dir() else [path] if path.is_file() else []
@@ -108,6 +136,29 @@ def _make_picture(words: Sequence[str], results: Path, name: str) -> str:
         return _name_missing(words[0])
     root = results.parents[len(RESULTS.parts) - 1]
     return f"![{' '.join(words[1:])}]({Path(os.path.relpath(path, (root / name).parent)).as_posix()})\n"
+
+
+def _make_figure(words: Sequence[str], results: Path, name: str) -> Iterator[str]:
+    if len(words) < 2 or words[0] not in FIGURES:
+        known = ", ".join(FIGURES)
+        raise ConfigError(
+            f"{name}: a marker of a figure is 'figure NAME FILE.json ...', NAME one of {known}; got {' '.join(words)}."
+        )
+    figure = FIGURES[words[0]]
+    missing = [file for file in words[1:] if not (results / file).is_file()]
+    if missing:
+        yield f"*{NOT_RUN}: {figure.text}: `{RESULTS / missing[0]}` is not stored; `{figure.command}` makes it.*\n"
+        return
+    root = results.parents[len(RESULTS.parts) - 1]
+    light, dark = (
+        Path(os.path.relpath(root / PLOTS / _name_figure(words, theme), (root / name).parent)).as_posix()
+        for theme in ("light", "dark")
+    )
+    yield (
+        f'<picture><source media="(prefers-color-scheme: dark)" srcset="{dark}"><img alt="{figure.text}" src="{light}">'
+        "</picture>\n"
+    )
+    yield from (f"{load_result(results / file).origin}\n" for file in words[1:])
 
 
 def _make_seed_parts(words: Sequence[str], results: Path, name: str) -> Iterator[str]:

@@ -111,7 +111,13 @@ def _has_no_recording(result: dict[str, Any]) -> bool:
         is_pose_lines(result)
         or is_pose_rows(result)
         or ("settings" in result and "contender" in (result.get("rows") or [{}])[0])
+        or _has_simulated_scenes(result)
     )
+
+
+def _has_simulated_scenes(result: dict[str, Any]) -> bool:
+    """Return whether a result is of the step, of the cost of maps or of a study of map fusion, which simulate what they need."""
+    return "costs" in result or "summaries" in result or "present_stages_ms" in (result.get("rows") or [{}])[0]
 
 
 def make_tables(stored: StoredResult) -> tuple[StoredTable, ...]:

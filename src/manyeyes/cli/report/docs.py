@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write tables of README and documents from the results stored in benchmarks/results; --check compares only.
+"""Write tables and figures of README and documents from the results stored in benchmarks/results; --check compares only.
 
 A table stands between <!-- report: FILE --> and <!-- end of report -->; FILE is below benchmarks/results. Results without command,
-commit, seeds or split are refused.
+commit, seeds or split are refused. Figures (<!-- report: figure NAME FILE -->) are SVG files in docs/images/plots.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Options:
 
 
 def main(options: Options) -> None:
-    """Write or check the tables of all documents."""
+    """Write or check the tables and figures of all documents."""
     from rich.console import Console
 
     from manyeyes._io import atomic_write_text
@@ -37,8 +37,8 @@ def main(options: Options) -> None:
     changed = [document for document in documents if document.text != document.updated]
     names = ", ".join(str(document.path.relative_to(options.root)) for document in changed)
     if options.check and changed:
-        raise ConfigError(f"{names}: tables differ from benchmarks/results; run 'manyeyes report docs'.")
+        raise ConfigError(f"{names}: differs from benchmarks/results; run 'manyeyes report docs'.")
     for document in changed:
         atomic_write_text(document.path, document.updated)
-    text = f"{names}: written" if changed else f"{len(documents)} documents are those of their results"
+    text = f"{names}: written" if changed else f"{len(documents)} documents and figures are those of their results"
     Console().print(text, highlight=False, soft_wrap=True)

@@ -1,0 +1,315 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of stored results for documents, by name: what each draws, from which results, and the command that writes them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from manyeyes.datatypes import ConfigError
+from manyeyes.viz.figure_svg import Panel, Theme, draw_level, draw_line, draw_point, draw_svg, split_form
+from manyeyes.viz.stored_tables import StoredResult
+
+_STACK_ALPHAS = (1.0, 0.75, 0.55, 0.4, 0.28, 0.2, 0.14)
+"""Opacity of the stages of a stack, one after the other."""
+_IOUS = ("AP@0.5", "AP@0.7")
+
+
+@dataclass(frozen=True)
+class StoredFigure:
+    """A figure. text: what it shows. command: writes a result that it can be drawn from. height_in: of its axes, inches."""
+
+    text: str
+    command: str
+    make: Callable[[Sequence[StoredResult]], list[Panel]]
+    height_in: float = 3.1
+
+
+def draw_figure(name: str, results: Sequence[StoredResult], theme: Theme) -> str:
+    """Return the SVG text of a figure of stored results.
+
+    Raises:
+        ConfigError: a result does not hold what the figure shows.
+    """
+    figure = FIGURES[name]
+    try:
+        return draw_svg(figure.make(results), theme, figure.height_in)
+    except (KeyError, TypeError, IndexError) as error:
+        files = ", ".join(str(stored.path) for stored in results)
+        raise ConfigError(
+            f"{files}: no result of the figure {name} ({error!r}); it needs one of: {figure.command}."
+        ) from error
+
+
+def _make_ap_bytes(results: Sequence[StoredResult]) -> list[Panel]:
+    rows = [row for stored in results for row in stored.result["rows"]]
+    names = list(dict.fromkeys(split_form(row["method"])[0] for row in rows))
+    has_two_forms = len({split_form(row["method"])[1] for row in rows}) > 1
+
+    def label_of(method: str) -> str:
+        name, has_memory = split_form(method)
+        return f"{name} + memory" if has_two_forms and has_memory else name
+
+    def make_panel(field: str, title: str) -> Panel:
+        def draw(axes: Any, theme: Theme) -> None:
+            for row in rows:
+                name, has_memory = split_form(row["method"])
+                colour = theme.series_colour(names.index(name))
+                if row["bytes_per_message"]:
+                    x = math.log2(row["bytes_per_message"])
+                    hollow = has_two_forms and not has_memory
+                    draw_point(axes, x, row[field], colour, label_of(row["method"]), hollow=hollow)
+                elif has_memory or not has_two_forms:
+                    draw_level(axes, row[field], colour, label_of(row["method"]))
+
+        return Panel(title, "log2(bytes per message)", title, draw)
+
+    return [make_panel("ap50", _IOUS[0]), make_panel("ap70", _IOUS[1])]
+
+
+def _make_differences(results: Sequence[StoredResult]) -> list[Panel]:
+    rows = [row for stored in results for row in stored.result["differences"]]
+    names = list(dict.fromkeys(row["description"] for row in rows))[::-1]
+
+    def draw(axes: Any, theme: Theme) -> None:
+        axes.axvline(0.0, color=theme.text, lw=1.0)
+        for place, metric in enumerate(_IOUS):
+            chosen = [row for row in rows if row["metric"] == metric]
+            x = [row["interval"]["value"] for row in chosen]
+            errors = [
+                [row["interval"]["value"] - row["interval"]["low"] for row in chosen],
+                [row["interval"]["high"] - row["interval"]["value"] for row in chosen],
+            ]
+            y = [names.index(row["description"]) + (0.15 if place == 0 else -0.15) for row in chosen]
+            axes.errorbar(
+                x,
+                y,
+                xerr=errors,
+                color=theme.series_colour(place),
+                marker="o",
+                ms=5,
+                capsize=2.5,
+                ls="none",
+                label=metric,
+            )
+        axes.set_yticks(range(len(names)), names)
+
+    return [Panel("", "paired difference of AP, 95 % interval over scenarios", "", draw)]
+
+
+def _make_robustness(results: Sequence[StoredResult]) -> list[Panel]:
+    rows = [row for stored in results for row in stored.result["rows"]]
+    fields = {
+        "delay_s": "delay [s]",
+        "heading_sigma_deg": "heading error [°]",
+        "position_sigma_m": "position error [m]",
+    }
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+
+    def make_panel(field: str, label: str) -> Panel:
+        def draw(axes: Any, theme: Theme) -> None:
+            for place, method in enumerate(methods):
+                mine = [row for row in rows if row["method"] == method and _is_along(row["perturbation"], field)]
+                if len(mine) == 1:
+                    draw_level(axes, mine[0]["ap"][1], theme.series_colour(place), method)
+                elif mine:
+                    x = [row["perturbation"][field] for row in mine]
+                    draw_line(axes, x, [row["ap"][1] for row in mine], theme.series_colour(place), method)
+
+        return Panel("", label, _IOUS[1], draw)
+
+    return [make_panel(field, label) for field, label in fields.items()]
+
+
+def _is_along(perturbation: dict[str, float], field: str) -> bool:
+    """Return whether nothing but one field of a disturbance differs from zero."""
+    names = ("delay_s", "heading_sigma_deg", "position_sigma_m", "packet_loss")
+    return not any(perturbation[name] for name in names if name != field)
+
+
+def _make_num_agents(results: Sequence[StoredResult]) -> list[Panel]:
+    rows = [row for stored in results for row in stored.result["rows"]]
+    methods = [
+        m
+        for m in dict.fromkeys(row["method"] for row in rows)
+        if any(r["num_agents"] > 1 for r in rows if r["method"] == m)
+    ]
+
+    def make_panel(title: str, ylabel: str, get: Callable[[dict[str, Any]], dict[str, float] | None]) -> Panel:
+        def draw(axes: Any, theme: Theme) -> None:
+            for place, method in enumerate(methods):
+                mine = [(row["num_agents"], get(row)) for row in rows if row["method"] == method]
+                found = [(float(n), interval) for n, interval in mine if interval is not None]
+                draw_line(axes, [n for n, _ in found], [i for _, i in found], theme.series_colour(place), method)
+            axes.set_xticks(sorted({row["num_agents"] for row in rows}))
+
+        return Panel(title, "agents", ylabel, draw)
+
+    return [
+        make_panel("Scenarios that have as many", _IOUS[0], lambda row: row["ap"][0]),
+        make_panel("The same scenarios", f"gain of {_IOUS[0]} over no fusion", lambda row: row["gain_over_no_fusion"]),
+    ]
+
+
+def _make_risk_coverage(results: Sequence[StoredResult]) -> list[Panel]:
+    rows = [row for stored in results for row in stored.result["nulls"]]
+    correctors = list(dict.fromkeys(row["corrector"] for row in rows))
+
+    def make_panel(kind: str) -> Panel:
+        def draw(axes: Any, theme: Theme) -> None:
+            for place, corrector in enumerate(correctors):
+                for row in (r for r in rows if r["corrector"] == corrector and r["kind"] == kind):
+                    risk = row["risk_by_coverage"]
+                    points = [((i + 1) / len(risk), v) for i, v in enumerate(risk) if v is not None]
+                    if points:
+                        axes.plot(*zip(*points), color=theme.series_colour(place), marker=".", lw=1.6, label=corrector)
+            axes.set_xlim(0.0, 1.0)
+            axes.set_ylim(-0.03, 1.0)
+
+        return Panel(f"Null pairs: {kind}", "coverage", "risk (wrong of answered)", draw)
+
+    return [make_panel(kind) for kind in dict.fromkeys(row["kind"] for row in rows)]
+
+
+def _make_pose_noise(results: Sequence[StoredResult]) -> list[Panel]:
+    rows = [
+        row
+        for stored in results
+        for row in stored.result["rows"]
+        if row["common_range"] is None and row["trial"]["noise"]["kind"] == "gaussian"
+    ]
+    correctors = list(dict.fromkeys(row["trial"]["corrector"] for row in rows))
+
+    def make_panel(title: str, ylabel: str, get: Callable[[dict[str, Any]], float | None]) -> Panel:
+        def draw(axes: Any, theme: Theme) -> None:
+            for place, corrector in enumerate(correctors):
+                mine = [(r["trial"]["noise"]["sigma_m"], get(r)) for r in rows if r["trial"]["corrector"] == corrector]
+                points = sorted((x, y) for x, y in mine if y is not None)
+                axes.plot(*zip(*points), color=theme.series_colour(place), marker="o", ms=4, lw=1.6, label=corrector)
+            axes.set_ylim(bottom=0.0)
+
+        return Panel(title, "sigma of the prior pose [m]", ylabel, draw)
+
+    return [
+        make_panel("Estimated within 1 m and 1°", "fraction of pairs", lambda row: row["score"]["success_rate"][0]),
+        make_panel(
+            "Displacement of the objects", "mean displacement [m]", lambda row: row["score"]["mean_displacement_m"]
+        ),
+    ]
+
+
+def _make_reliability(results: Sequence[StoredResult]) -> list[Panel]:
+    rows = [row for stored in results for row in stored.result["rows"]]
+
+    def draw(axes: Any, theme: Theme) -> None:
+        axes.plot([0.0, 1.0], [0.0, 1.0], color=theme.text, lw=1.0, ls="--", label="calibrated")
+        for place, row in enumerate(rows):
+            x = [part["mean_score"] for part in row["bins"]]
+            draw_line(axes, x, [part["correct"] for part in row["bins"]], theme.series_colour(place), row["method"])
+
+    return [Panel("", "score", "fraction of correct boxes, IoU 0.5", draw)]
+
+
+def _make_map_observations(results: Sequence[StoredResult]) -> list[Panel]:
+    rows = [row for stored in results for row in stored.result["summaries"]]
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+
+    def draw(axes: Any, theme: Theme) -> None:
+        for place, method in enumerate(methods):
+            mine = [row for row in rows if row["method"] == method]
+            x = [float(row["group"].split()[0]) for row in mine]
+            draw_line(axes, x, [row["mean_ap"] for row in mine], theme.series_colour(place), method)
+        ticks = sorted({float(row["group"].split()[0]) for row in rows})
+        axes.set_xscale("log")
+        axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.set_xticks([], minor=True)
+
+    return [Panel("Crossings and dividers, 95 % intervals", "observations", "mAP (Chamfer-exact)", draw)]
+
+
+def _make_latency_stack(results: Sequence[StoredResult]) -> list[Panel]:
+    rows = [row for stored in results for row in stored.result["rows"] if row["drive"] is not None][::-1]
+    stages = list(dict.fromkeys(stage for row in rows[::-1] for stage in row["present_stages_ms"]))
+
+    def draw(axes: Any, theme: Theme) -> None:
+        left = [0.0] * len(rows)
+        for place, part in enumerate(("share", "perceive")):
+            mine = [stage for stage in stages if stage.startswith(part)]
+            for number, stage in enumerate(mine):
+                widths = [row["present_stages_ms"].get(stage, 0.0) for row in rows]
+                alpha = _STACK_ALPHAS[min(number, len(_STACK_ALPHAS) - 1)]
+                axes.barh(
+                    range(len(rows)),
+                    widths,
+                    0.62,
+                    left=left,
+                    color=theme.series_colour(place),
+                    alpha=alpha,
+                    label=stage,
+                )
+                left = [a + b for a, b in zip(left, widths)]
+        names = [f"{row['case']},\n{row['weights']}, {row['agents']:g} agents" for row in rows]
+        axes.set_yticks(range(len(rows)), names)
+
+    return [Panel("One step of an agent, by stage", "CPU time on one core [ms]", "", draw)]
+
+
+def _make_map_cost(results: Sequence[StoredResult]) -> list[Panel]:
+    rows = [row for stored in results for row in stored.result["costs"]]
+    ways = list(dict.fromkeys(row["way"] for row in rows))
+    labels = {"tiles": "tiles of tokens", "dense": "one dense BEV grid"}
+
+    def make_panel(field: str, ylabel: str) -> Panel:
+        def draw(axes: Any, theme: Theme) -> None:
+            for place, way in enumerate(ways):
+                mine = sorted((row["cells"] / 1000, row[field]) for row in rows if row["way"] == way)
+                axes.plot(
+                    *zip(*mine), color=theme.series_colour(place), marker="o", ms=4, lw=1.6, label=labels.get(way, way)
+                )
+            axes.set(xlim=(0.0, None), ylim=(0.0, None))
+
+        return Panel("", "cells of the map (thousands)", ylabel, draw)
+
+    return [make_panel("seconds", "CPU time [s]"), make_panel("peak_mib", "peak memory [MiB]")]
+
+
+_EVALUATE = "manyeyes evaluate --data data/carla-towns-small --split test"
+FIGURES = {
+    "ap-bytes": StoredFigure("AP against log2(bytes per message), by method", _EVALUATE, _make_ap_bytes),
+    "differences": StoredFigure("Paired differences of AP with 95 % intervals", _EVALUATE, _make_differences),
+    "robustness": StoredFigure(
+        "AP against delay, heading error and position error",
+        "manyeyes study robustness --data data/carla-towns-small --split test",
+        _make_robustness,
+    ),
+    "num-agents": StoredFigure(
+        "AP against the number of agents",
+        "manyeyes study num-agents --data data/carla-towns-small --split test",
+        _make_num_agents,
+    ),
+    "reliability": StoredFigure(
+        "Fraction of correct boxes against their score",
+        "python benchmarks/reliability.py --data data/carla-towns-small --split test",
+        _make_reliability,
+    ),
+    "risk-coverage": StoredFigure(
+        "Risk against coverage of pose correctors without a prior",
+        "manyeyes study pose-estimation --data data/carla-towns-small --split val",
+        _make_risk_coverage,
+    ),
+    "pose-noise": StoredFigure(
+        "Pose correctors against the noise of the prior pose",
+        "manyeyes study pose-estimation --data data/carla-towns-small --split val",
+        _make_pose_noise,
+    ),
+    "map-observations": StoredFigure(
+        "mAP of fused maps against the number of observations", "manyeyes study fusion", _make_map_observations
+    ),
+    "latency-stack": StoredFigure("CPU time of a step by stage", "python benchmarks/step.py", _make_latency_stack),
+    "map-cost": StoredFigure(
+        "CPU time and memory of map prediction against map size", "python benchmarks/map_cost.py", _make_map_cost
+    ),
+}
+"""Figures that a document can name, by their names."""
