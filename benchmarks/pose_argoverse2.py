@@ -9,7 +9,7 @@ observe the labelled vehicles within 60 m, the other one 70 % of them. ``nulls``
 vehicles that stay parked, so that every answer is wrong.
 
 There are two sweeps and 156 labelled instants of a single drive. Two vehicles that observe each other are not among the data:
-see docs/pose/index.md.
+see docs/concepts/pose-correction.md.
 
 python -m benchmarks.pose_argoverse2 LOG [--tables detections ...] [--scale 1.0] [--out benchmarks/results/pose_argoverse2.json]
 """

@@ -22,7 +22,7 @@ page.parent.mkdir(parents=True, exist_ok=True)
 where = load_place("cross", size_m=160.0)
 crowd = simulate_crowd(where, 60, seed=1)
 
-# Observations of your own are read from a file in the format of docs/maps/observation.md: one row per observation.
+# Observations of your own are read from a file in the format of docs/reference/map-observations.md: one row per observation.
 file = page.with_name("observations.parquet")
 write_observations(file, crowd.observations, where.frame)
 observations = read_observations(file).observations

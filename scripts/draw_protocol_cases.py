@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draw the golden cases of detection protocols for docs/benchmarks/protocol_cases.md: python scripts/draw_protocol_cases.py
+"""Draw the golden cases of detection protocols for docs/reference/protocol-cases.md: python scripts/draw_protocol_cases.py
 
 Boxes and results are those of tests/evaluation/protocol_cases.py, which the tests assert; nothing is drawn by hand.
 """

@@ -205,9 +205,7 @@ def make_api_pages() -> dict[str, str]:
     for name, definition in sorted(top.items(), key=lambda item: item[0].lower()):
         rows.append((f"[`{name}`]({definition.module.split('.')[1]}.md)", f"`{definition.module}`"))
     table = format_table(("name", "module"), rows)
-    about = (
-        "Names that `import manyeyes` gives, in metres, radians and nanoseconds ([conventions](../../conventions.md))."
-    )
+    about = "Names that `import manyeyes` gives, in metres, radians and nanoseconds ([conventions](../../concepts/conventions.md))."
     pages["api/index.md"] = f"# Public names\n\n{GENERATED}\n\n{about}\n\n{table}\n"
     return dict(sorted(pages.items()))
 

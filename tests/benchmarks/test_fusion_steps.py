@@ -10,7 +10,7 @@ from pathlib import Path
 from manyeyes.training.detector.fusion_presets import FUSION_TRAINING_PRESETS
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = ROOT / "docs" / "benchmarks" / "baselines.md"
+PAGE = ROOT / "docs" / "papers" / "baselines.md"
 
 
 def load_benchmark():

@@ -87,7 +87,7 @@ def test_presets_in_the_order_of_nature(preset):
 
 
 def test_a_budgeted_message_fits_a_frame_of_its_g5_and_a_dense_one_does_not():
-    """messages.md: 26.8 kB are 36 ms of payload at 6 Mb/s; 125.7 kB are 168 ms: more than a frame of 100 ms."""
+    """26.8 kB are 36 ms of payload at 6 Mb/s; 125.7 kB are 168 ms: more than a frame of 100 ms."""
     channel = Channel(replace(channel_preset("its-g5"), per_packet_overhead_bytes=0, busy_ratio_limit=1.0))
     fits = channel.transmit([Transmission(1, HERE, packets(20, 1340), 0)], 2, HERE)
     assert 36 * MS <= max(d.arrival_ns for d in fits) <= 42 * MS

@@ -6,7 +6,7 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-TEXT = (ROOT / "docs" / "development" / "architecture.md").read_text(encoding="utf-8")
+TEXT = (ROOT / "docs" / "concepts" / "architecture.md").read_text(encoding="utf-8")
 
 
 def test_layers_are_those_of_the_import_contract() -> None:

@@ -8,13 +8,13 @@ import pytest
 from manyeyes.simulator.fleet import CROWDS, PLACES
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = (ROOT / "docs" / "simulation" / "fleet.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "reference" / "fleet.md").read_text(encoding="utf-8")
 
 
 def test_the_example_runs(capsys):
     pytest.importorskip("shapely")
     (code,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-    exec(compile(code, "docs/simulation/fleet.md", "exec"), {})
+    exec(compile(code, "docs/reference/fleet.md", "exec"), {})
     assert capsys.readouterr().out == "20 observations, 40 true elements\n"
 
 

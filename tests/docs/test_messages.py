@@ -12,7 +12,7 @@ from manyeyes.comms.drop_counts import DropCounts
 from manyeyes.comms.inbox import RejectionReason
 from manyeyes.comms.token_format import MAX_TOKEN_VALUE
 
-TEXT = (Path(__file__).resolve().parents[2] / "docs" / "messages.md").read_text(encoding="utf-8")
+TEXT = (Path(__file__).resolve().parents[2] / "docs" / "concepts" / "messages.md").read_text(encoding="utf-8")
 
 
 def test_every_reason_is_in_the_table() -> None:

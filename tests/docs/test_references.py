@@ -55,7 +55,7 @@ def find_broken_links(path: Path) -> list[str]:
     """The relative links and images of a document whose file or anchor does not exist."""
     text = re.sub(r"```.*?```", "", path.read_text(encoding="utf-8"), flags=re.S)
     out = []
-    for target in re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r'(?:src|href)="([^"]+)"', text):
+    for target in re.findall(r"\]\(([^)\s]+)\)", text) + re.findall(r'(?:src|srcset|href)="([^"]+)"', text):
         name, _, anchor = target.partition("#")
         if re.match(r"[a-z]+:", target):
             continue

@@ -105,14 +105,21 @@ def test_links_that_leave_the_folder_become_pages_or_names() -> None:
     assert HOOKS.redirect_links(text, PurePosixPath("guides")) == (
         "[a](../index.md) b (`benchmarks/results/x.json`) [c](own-data.md) `x.py`"
     )
-    assert HOOKS.move_links("[a](docs/messages.md) [b](https://x.org)", PurePosixPath("development")) == (
-        "[a](../messages.md) [b](https://x.org)"
+    assert HOOKS.move_links("[a](docs/concepts/messages.md) [b](https://x.org)", PurePosixPath("development")) == (
+        "[a](../concepts/messages.md) [b](https://x.org)"
     )
 
 
 def test_lists_and_tables_after_a_paragraph_get_an_empty_line() -> None:
     text = "A:\n- one\n- two\n  more\nB\n| a |\n|---|\n```\nx\n- y\n```"
     assert HOOKS.separate_blocks(text) == ("A:\n\n- one\n- two\n  more\nB\n\n| a |\n|---|\n```\nx\n- y\n```")
+
+
+def test_pictures_of_two_themes_become_images_of_the_theme_of_the_site() -> None:
+    text = '<picture><source media="(prefers-color-scheme: dark)" srcset="a/x-dark.svg"><img alt="X" src="a/x-light.svg"></picture>'
+    assert HOOKS.split_pictures(f"One\n\n{text}\n") == (
+        'One\n\n<p><img alt="X" src="a/x-light.svg#only-light"><img alt="X" src="a/x-dark.svg#only-dark"></p>\n'
+    )
 
 
 @pytest.mark.slow

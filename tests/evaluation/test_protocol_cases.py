@@ -28,7 +28,7 @@ def test_overlaps_of_the_volumes_are_those_of_the_titles() -> None:
 
 
 def test_every_case_is_drawn_in_the_documentation(tmp_path) -> None:
-    page = (ROOT / "docs/benchmarks/protocol_cases.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/reference/protocol-cases.md").read_text(encoding="utf-8")
     for case in ALL_CASES:
         assert f"../images/{case.name}.png" in page and (ROOT / f"docs/images/{case.name}.png").is_file()
         assert all(f"{panel.ap:.3f}" in page for panel in case.panels)

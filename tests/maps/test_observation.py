@@ -127,7 +127,7 @@ def test_numbers_are_taken_up_to_their_bound_and_refused_beyond(name: str) -> No
 
 
 def test_the_documented_limits_are_those_that_are_checked() -> None:
-    page = (Path(__file__).resolve().parents[2] / "docs" / "maps" / "observation.md").read_text()
+    page = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "map-observations.md").read_text()
     rows = re.findall(r"^\| `(\w+)` \| (\S+) \| [\w, ]+ \| ", page, re.MULTILINE)
     assert rows == [(f.name, f"{getattr(LIMITS, f.name):g}") for f in fields(LIMITS)]
 

@@ -58,7 +58,7 @@ def crowd(count: int) -> list[Observation]:
 
 def test_the_documented_example_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    page = (Path(__file__).resolve().parents[2] / "docs" / "maps" / "observation.md").read_text()
+    page = (Path(__file__).resolve().parents[2] / "docs" / "reference" / "map-observations.md").read_text()
     names: dict = {}
     for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
         exec(block, names)

@@ -111,7 +111,7 @@ def test_a_figure_names_axes_methods_and_units() -> None:
     assert {"early - late", "AP@0.7"} <= set(shown_texts("differences"))
 
 
-def test_forms_of_a_method_are_told_apart_where_there_are_both() -> None:
+def test_forms_of_a_method_have_labels_of_their_own() -> None:
     rows = [ap_row("late", 0.7, 2048.0), ap_row("late-temporal", 0.8, 2048.0)]
     text = draw_figure("ap-bytes", [stored({"rows": rows})], LIGHT)
     assert "late + memory" in text and ">late<" in text
@@ -141,14 +141,14 @@ def root(tmp_path: Path) -> Path:
     }
     text = json.dumps({"provenance": origin, "result": {**EVALUATION, "stats": []}})
     (tmp_path / "benchmarks/results/dev_test.json").write_text(text)
-    (tmp_path / "docs/more/p.md").write_text(f"# Page\n\n<!-- report: figure ap-bytes dev_test.json -->\n{END}\n")
+    (tmp_path / "docs" / "more" / "p.md").write_text(f"# Page\n\n<!-- report: figure ap-bytes dev_test.json -->\n{END}\n")
     return tmp_path
 
 
 def test_figures_are_written_beside_the_documents_and_checked(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["report", "docs", "--root", str(root), "--check"]) == 1
     assert main(["report", "docs", "--root", str(root)]) == 0
-    page = (root / "docs/more/p.md").read_text()
+    page = (root / "docs" / "more" / "p.md").read_text()
     assert 'srcset="../images/plots/ap-bytes-dev-test-dark.svg"' in page
     assert 'src="../images/plots/ap-bytes-dev-test-light.svg"' in page
     assert "`manyeyes evaluate`, commit 0123456789ab, seed 0, split val." in page

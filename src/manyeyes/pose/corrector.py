@@ -97,7 +97,7 @@ DETECTOR_BOXES_CONFIG = CorrectorConfig(
 )
 """For boxes of detectors: errors of one view are correlated, since a sensor observes one side of a vehicle, longitudinal errors are
 larger than lateral ones, since the far end is seldom observed, and their tails are heavy. Vehicles in a queue agree by chance
-(docs/pose/index.md).
+(docs/concepts/pose-correction.md).
 """
 
 

@@ -132,7 +132,7 @@ def correct_pose(
 
     Returns:
         The pose to use with its covariance, the pairs of boxes, and the status: AMBIGUOUS and NO_MATCH are not measured, and their
-        pose is the prior or None (docs/pose/index.md).
+        pose is the prior or None (docs/concepts/pose-correction.md).
 
     Raises:
         ConfigError: the corrector is not known. ShapeError: an array has another shape.

@@ -135,7 +135,7 @@ def _one_sensor(mix: str, val: int = 8, test: int = 16) -> SimulationPreset:
     )
 
 
-# To be simulated once, for final tables (docs/benchmarks/protocol.md). Strata are splits: they are reported apart.
+# To be simulated once, for final tables (docs/reference/protocol.md). Strata are splits: they are reported apart.
 _SEALED = replace(
     _crowded(
         (

@@ -26,7 +26,7 @@ class Options:
     """What is fused, and how."""
 
     observations: tyro.conf.Positional[Path]
-    """A Parquet file of observations, a folder of them, or a folder of 'map simulate'; see docs/maps/observation.md."""
+    """A Parquet file of observations, a folder of them, or a folder of 'map simulate'; see docs/reference/map-observations.md."""
     out: OutputFolder | None = None
     """Folder for the map, two GeoParquet files; 'map' beside the observations by default."""
     method: str = "manyeyes"

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What one agent saw of the map, once: elements in its own frame, its prior pose, what it could see; and its file form.
 
-The file form is documented in docs/maps/observation.md: Parquet, one row an observation.
+The file form is documented in docs/reference/map-observations.md: Parquet, one row an observation.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Observations as Parquet, one row each (docs/maps/observation.md), and reading that rejects what cannot be used."""
+"""Observations as Parquet, one row each (docs/reference/map-observations.md), and reading that rejects what cannot be used."""
 
 from __future__ import annotations
 
@@ -231,7 +231,7 @@ def _open(file: Path, expected: MapFrame | None) -> Any:
     if missing or twice:
         wrong = f"{', '.join(missing)} missing" if missing else f"{', '.join(twice)} more than once"
         raise ObservationError(
-            f"{file}: expected the columns of docs/maps/observation.md; {wrong}. Write the file again."
+            f"{file}: expected the columns of docs/reference/map-observations.md; {wrong}. Write the file again."
         )
     paths = [opened.metadata.schema.column(k).path for k in range(opened.metadata.num_columns)]
     texts = [path for path in paths if path in _TEXTS or (path.startswith("elements.") and path.endswith(".kind"))]
@@ -299,7 +299,7 @@ def _read_frame(file: Path, stored: dict[bytes, bytes]) -> MapFrame:
         geographic = origin["crs"]
     except (KeyError, ValueError, TypeError, OverflowError, RecursionError) as error:
         raise ObservationError(
-            f"{file}: expected metadata 'manyeyes' with format, version, crs and origin as in docs/maps/observation.md; "
+            f"{file}: expected metadata 'manyeyes' with format, version, crs and origin as in docs/reference/map-observations.md; "
             f"{type(error).__name__} {shorten(error)}."
         ) from error
     if kind != "observation" or not isinstance(version, int) or not 1 <= version <= FORMAT_VERSION:
@@ -464,7 +464,7 @@ def _xy(pa: Any, rings: Sequence[NDArray[np.float64]]) -> Any:
 
 
 def _schema(pa: Any) -> Any:
-    """Return the columns of docs/maps/observation.md."""
+    """Return the columns of docs/reference/map-observations.md."""
     number, text = pa.float64(), pa.string()
     xy = pa.struct([("x", number), ("y", number)])
     point = pa.struct([("x", number), ("y", number), ("sigma", number)])

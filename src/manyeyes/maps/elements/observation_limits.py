@@ -2,8 +2,8 @@
 """Bounds on the numbers of an observation.
 
 A coordinate that is finite but far, or a line of a million points, would otherwise cost memory and time without bound in the
-steps of a fusion. Each bound lies well above what sensors, map models and the wire format produce; docs/maps/observation.md
-lists them with their reasons.
+steps of a fusion. Each bound lies well above what sensors, map models and the wire format produce;
+docs/reference/map-observations.md lists them with their reasons.
 """
 
 from __future__ import annotations

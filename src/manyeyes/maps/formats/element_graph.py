@@ -16,7 +16,7 @@ from manyeyes.maps.fusion.graph import RELATIONS, build_element_graph
 
 
 def write_element_graph(vector_map: VectorMap, path: Path | str) -> None:
-    """Write the elements as nodes and their relations as edges; docs/maps/index.md lists the arrays.
+    """Write the elements as nodes and their relations as edges; docs/guides/maps.md lists the arrays.
 
     Args:
         vector_map: N elements, whose points stay in metres in the map's frame.

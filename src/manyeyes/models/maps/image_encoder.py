@@ -5,7 +5,7 @@ Sources: He et al., CVPR 2016 (basic and bottleneck blocks); Lin et al., CVPR 20
 running
 statistics after training, so that the features of one agent do not depend on the rest of the batch. A norm over
 channels does not
-train on rasters, most of whose cells are empty: docs/maps/model.md.
+train on rasters, most of whose cells are empty: docs/concepts/map-model.md.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ def read_lidars(text: str) -> dict[str, LidarSpec]:
 
 
 def describe_lidars() -> str:
-    """Return the table of the documentation (docs/simulation/lidars.md) in Markdown."""
+    """Return the table of the documentation (docs/reference/lidars.md) in Markdown."""
     lines = [
         "| name | beams | elevations [deg] | azimuth [deg] | range [m] | noise [cm] | height [m] | intensity |",
         "|---|---|---|---|---|---|---|---|",

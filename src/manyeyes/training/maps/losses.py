@@ -3,7 +3,7 @@
 
 Sources: MapTR (ICLR 2023) and MapTRv2 (IJCV 2024), with their published weights but for segmentation, which weighs
 ten times as much
-(docs/maps/model.md); focal loss, Lin et al., ICCV 2017. Point terms are sums over an element's points and means over
+(docs/concepts/map-model.md); focal loss, Lin et al., ICCV 2017. Point terms are sums over an element's points and means over
 elements.
 """
 
