@@ -2,7 +2,7 @@
 """A second device without a GPU: tensors that are on cuda:0 for Python, computed on the CPU, and refused beside CPU tensors.
 
 Three hooks of torch cooperate. A wrapper subclass holds a CPU tensor and reports cuda:0 to Python; to C++ it reports ``meta``,
-since autograd of a CPU build aborts for a tensor that says cuda. A dispatch mode executes every operator that meets such a
+since autograd of a CPU build aborts for a tensor on cuda. A dispatch mode executes every operator that meets such a
 tensor, or that makes one, on the held tensors; it checks and counts the call before. A function mode turns the device of
 factories and ``to`` into ``meta``, and stays active in the backward pass, which torch would otherwise run without it.
 

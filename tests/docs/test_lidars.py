@@ -10,7 +10,7 @@ PAGE = (DOCS / "reference" / "lidars.md").read_text(encoding="utf-8")
 
 
 def test_the_page_lists_the_sensors_of_the_table():
-    (table,) = re.findall(r"<!-- lidars -->\n(.*?)\n<!-- end of lidars -->", PAGE, re.DOTALL)
+    (table,) = re.findall(r"<!-- lidars -->\n\n(.*?)\n\n<!-- end of lidars -->", PAGE, re.DOTALL)
     assert table == describe_lidars()
 
 

@@ -79,7 +79,7 @@ def test_ground_is_found_beside_a_map_or_taken_near_its_lines(tmp_path):
     assert read_ground(tmp_path / "city" / "map", OLD).area_m2 == 50 * 40
 
 
-def test_the_command_compares_frames_and_says_what_it_assumes(tmp_path, capsys):
+def test_the_command_compares_frames_and_prints_what_it_assumes(tmp_path, capsys):
     write_vector_map(OLD, tmp_path / "old" / "map")
     write_vector_map(move_to_frame(NEW, OTHER), tmp_path / "new" / "map")
     for name, runs in (("old", ground(0, 100)), ("new", ground(60, 200))):

@@ -152,7 +152,7 @@ def test_a_double_line_separates_directions_where_no_stop_line_does():
             assert eastward == (-sign if middle[0, 1] > 0 else sign)
 
 
-def test_a_gap_is_bridged_both_ways_where_nothing_tells_a_direction(tmp_path):
+def test_a_gap_is_bridged_both_ways_where_nothing_gives_a_direction(tmp_path):
     lines = [*straight(3.5, 0.0, x=(0, 50)), *straight(3.7, 0.2, x=(60, 100))]
     m = with_topology(MapElements.of(lines, DIVIDER, style=DASHED), FRAME)
     routes = Routes(m, tmp_path / "gap.osm")

@@ -194,7 +194,7 @@ def test_two_maps_of_one_place_become_one_and_their_shift_is_found(tmp_path):
     assert duplicated_fraction(MapElements.cat([first.elements, moved])) == 1.0
     assert duplicated_fraction(fused.elements) < duplicated_fraction(first.elements) < 0.12
     assert fused.elements.lengths().sum() > 0.95 * first.elements.lengths().sum()
-    # Half way between the two, as nothing tells which is right.
+    # Half way between the two, as neither is known to be right.
     distance = find_nearest_line(fused.elements.points, first.elements.points, first.elements.offsets, 5.0).distance
     assert np.median(distance) < 0.35
 
@@ -218,7 +218,7 @@ def test_import_takes_maps_of_three_formats_into_one_frame(tmp_path, capsys):
     assert 0.95 < fused.lengths().sum() / first.elements.lengths().sum() < 1.1
 
 
-def test_import_says_what_it_leaves_out_and_refuses_mixtures(two_lanes, tmp_path, capsys):
+def test_import_prints_what_it_leaves_out_and_refuses_mixtures(two_lanes, tmp_path, capsys):
     export_map(two_lanes(), tmp_path / "m.gpkg")
     assert cli.main(["map", "import", str(tmp_path / "m.gpkg"), "--out", str(tmp_path / "in")]) == 0
     assert "left out: 1 of m.gpkg: state candidate" in capsys.readouterr().out

@@ -74,7 +74,7 @@ def test_clouds_and_tokens_enter_and_boxes_and_tokens_leave_on_the_cpu(device, c
         bound = tolerance * float(mine.abs().max()) if mine.is_floating_point() else 0.0
         assert float((mine - its).abs().max()) <= bound
     for mine, its in (boxes, detected):
-        # Random weights score many boxes alike, so that rounding may change their order, and who suppresses whom.
+        # Random weights score many boxes alike, so that rounding may change their order, and which one suppresses the other.
         assert type(its.center) is torch.Tensor and its.label.device.type == "cpu" and len(mine) == len(its) > 10
         away = torch.cdist(mine.center, its.center, compute_mode="donot_use_mm_for_euclid_dist").amin(1)
         assert float((away < 1e-3).float().mean()) > 0.9

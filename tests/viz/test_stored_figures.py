@@ -141,7 +141,9 @@ def root(tmp_path: Path) -> Path:
     }
     text = json.dumps({"provenance": origin, "result": {**EVALUATION, "stats": []}})
     (tmp_path / "benchmarks/results/dev_test.json").write_text(text)
-    (tmp_path / "docs" / "more" / "p.md").write_text(f"# Page\n\n<!-- report: figure ap-bytes dev_test.json -->\n{END}\n")
+    (tmp_path / "docs" / "more" / "p.md").write_text(
+        f"# Page\n\n<!-- report: figure ap-bytes dev_test.json -->\n{END}\n"
+    )
     return tmp_path
 
 

@@ -129,15 +129,15 @@ def _move(center: F32x2, motion: F64x2) -> F64x2:  # pragma: no cover
 def _associate(expected: F64x2, places: F64x2, gate_m: float) -> I64x1:  # pragma: no cover
     """Return for each expected position (N, 2) the place (M, 2) that is its mutual nearest neighbour within the gate, else -1."""
     partner, nearest = np.full(len(expected), -1), np.full(len(places), -1)
-    best, least = np.full(len(expected), np.inf), np.full(len(places), np.inf)
+    best, min_distance = np.full(len(expected), np.inf), np.full(len(places), np.inf)
     for i in range(len(expected)):
         for j in range(len(places)):
             dx, dy = places[j, 0] - expected[i, 0], places[j, 1] - expected[i, 1]
             d = dx * dx + dy * dy
             if d < best[i]:
                 best[i], partner[i] = d, j
-            if d < least[j]:
-                least[j], nearest[j] = d, i
+            if d < min_distance[j]:
+                min_distance[j], nearest[j] = d, i
     for i in range(len(expected)):
         if partner[i] >= 0 and (nearest[partner[i]] != i or best[i] > gate_m * gate_m):
             partner[i] = -1
@@ -187,10 +187,10 @@ def nearest_boxes(places: F32x2, center: F32x2, max_distance_m: float) -> I64x1:
     """Return for each place (T, 2) the row of the nearest of centres (N, 2 or more), the first of ties; N beyond the distance."""
     nearest = np.full(len(places), len(center))
     for i in range(len(places)):
-        least = np.float32(max_distance_m * max_distance_m)
+        min_squared = np.float32(max_distance_m * max_distance_m)
         for j in range(len(center)):
             dx, dy = center[j, 0] - places[i, 0], center[j, 1] - places[i, 1]
             d = dx * dx + dy * dy
-            if d < least or (d == least and nearest[i] == len(center)):
-                least, nearest[i] = d, j
+            if d < min_squared or (d == min_squared and nearest[i] == len(center)):
+                min_squared, nearest[i] = d, j
     return nearest

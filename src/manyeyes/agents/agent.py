@@ -399,7 +399,7 @@ class Agent:
         return weigh_received(frame, known, self._assessment)
 
     def _bound_orphans(self, frame: AgentFrame, boxes: Boxes, messages: Sequence[Message]) -> Boxes:
-        """Return the boxes with bounded scores where nobody proposes an object; senders of several such are recorded."""
+        """Return the boxes with bounded scores where no agent proposes an object; senders of several such are recorded."""
         if self.misbehaviour is None or self._assessment is None or self._assessment.claims is None:
             return boxes
         orphans = find_orphans(frame, boxes, self.perception_cache, messages)

@@ -61,7 +61,7 @@ def limit_contents(message: Message, budget_bytes: int) -> Message | None:
         rows = torch.arange(count) * len(points) // max(count, 1)
         return replace(base, points=points[rows])
 
-    return _find_most(with_points, len(points), budget_bytes) or (None if boxes is None else limited)
+    return _find_largest(with_points, len(points), budget_bytes) or (None if boxes is None else limited)
 
 
 def _limit_boxes(message: Message, boxes: Boxes, budget_bytes: int) -> Message | None:
@@ -71,11 +71,11 @@ def _limit_boxes(message: Message, boxes: Boxes, budget_bytes: int) -> Message |
         rows, descriptors = order[:count], message.descriptors
         return replace(message, objects=boxes[rows], descriptors=None if descriptors is None else descriptors[rows])
 
-    return _find_most(with_boxes, len(boxes), budget_bytes)
+    return _find_largest(with_boxes, len(boxes), budget_bytes)
 
 
-def _find_most(make: Callable[[int], Message], count: int, budget_bytes: int) -> Message | None:
-    """Return the message with most contents of those that make returns for 1 to count, within the budget; None if there is none."""
+def _find_largest(make: Callable[[int], Message], count: int, budget_bytes: int) -> Message | None:
+    """Return the message of most contents, of those that make returns for 1 to count, within the budget; None without any."""
     if count == 0 or _count_bytes(make(count)) <= budget_bytes:
         return make(count)
     low, high = 0, count

@@ -112,7 +112,7 @@ class PerceptionCache:
         return require_tokens(self.detector)
 
     def clear(self) -> None:
-        """Forget all frames."""
+        """Remove the states of all frames."""
         self._outputs, self._merged, self._sent, self.last_fused = [], None, [], None
         self._motions = None, []
 

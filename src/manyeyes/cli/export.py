@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Exports what methods detect in a recording: KITTI's result files, or nuScenes' result JSON.
 
-KITTI: boxes in the camera of the frame; of recordings without KITTI's calibrations in a camera at the ego's LiDAR that looks ahead,
+KITTI: boxes in the camera of the frame; of recordings without KITTI's calibrations in a forward camera at the ego's LiDAR,
 which is written beside them. nuScenes: boxes in the recording's world.
 """
 

@@ -60,10 +60,10 @@ def count_fitting_clustered_cells(
         # A further key lowers the bytes of the cells by at most one, which its index takes: no body gets shorter by a token.
         for end in range(at + 1, min(len(cluster), at + 65535) + 1):
             seen.add(cluster[end - 1])
-            least = fixed_bytes + len(seen) * shared_bytes + (end - at) * (1 + own_bytes)
-            if least > room or len(seen) > MAX_CLUSTERS:
+            min_bytes = fixed_bytes + len(seen) * shared_bytes + (end - at) * (1 + own_bytes)
+            if min_bytes > room or len(seen) > MAX_CLUSTERS:
                 break
-            whole = least + primitives.cells_size(np.sort(key[at:end]))
+            whole = min_bytes + primitives.cells_size(np.sort(key[at:end]))
             if whole > room:
                 break
             best, size = end - at, whole

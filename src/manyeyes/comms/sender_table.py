@@ -105,7 +105,7 @@ class SenderTable:
         return [sender.current for _, sender in sorted(self._senders.items()) if sender.messages]
 
     def clear(self) -> None:
-        """Forget all senders."""
+        """Remove all senders and their trust."""
         self._senders.clear()
         self._trust = {}
 

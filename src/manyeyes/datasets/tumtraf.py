@@ -172,7 +172,7 @@ class TumTrafRecording(RecordingReader):
 
 
 def _level(cloud: PcdCloud, world_from_lidar: Transform) -> tuple[PcdCloud, Transform]:
-    """Return the cloud in a frame at the LiDAR whose z axis is the world's, and its pose: roadside LiDARs look down."""
+    """Return the cloud in a frame at the LiDAR whose z axis is the world's, and its pose: roadside LiDARs are tilted down."""
     yaw = float(world_from_lidar.yaw)
     x, y, z = world_from_lidar.translation.tolist()
     world_from_level = Transform.from_xyz_yaw(x, y, z, yaw)

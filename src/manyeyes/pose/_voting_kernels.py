@@ -516,9 +516,9 @@ def refine_poses(
     rounds: int,
 ) -> RefinedPoses:  # pragma: no cover - compiled
     """Refine each of the poses (K, 3) by :func:`refine_pose`."""
-    most = min(len(a.xy), len(b.xy))
+    max_pairs = min(len(a.xy), len(b.xy))
     poses, information = np.empty((len(starts), 3)), np.empty((len(starts), 3, 3))
-    pairs, misfit = np.empty((len(starts) * most, 2), np.int64), np.empty(len(starts) * most)
+    pairs, misfit = np.empty((len(starts) * max_pairs, 2), np.int64), np.empty(len(starts) * max_pairs)
     start = np.zeros(len(starts) + 1, np.int64)
     for k in range(len(starts)):
         refined = refine_pose(starts[k], a, b, is_compatible, slack, gate, rounds)

@@ -124,7 +124,7 @@ def update_body(
     joint = prior.covariance + variance
     if innovation @ np.linalg.solve(joint, innovation) > config.gate:
         return before
-    # A measurement right after another one says nothing new.
+    # A measurement right after another one adds no information.
     weight = max(1.0 - math.exp(-(time_s - prior.time_s) / config.correlation_s), 1e-3)
     gain = np.linalg.solve(prior.covariance + variance / weight, prior.covariance).T
     rest_of = np.eye(2) - gain

@@ -216,14 +216,14 @@ def _hypotheses(a: Landmarks, b: Landmarks, is_compatible: NDArray[np.bool_], co
     matches = loops.match_edges(
         _numbers(a), _numbers(b), edges_a, edges_b, is_compatible, config.edge_gate, 100 * config.max_hypotheses
     )
-    misfit, most = matches.misfit, config.max_hypotheses
+    misfit, max_kept = matches.misfit, config.max_hypotheses
     rows = np.arange(len(misfit))
-    if len(misfit) > most:
+    if len(misfit) > max_kept:
         # Sorting all of them, of which most are not kept, would cost as much as finding them.
-        rows = np.flatnonzero(misfit <= np.partition(misfit, most - 1)[most - 1])
+        rows = np.flatnonzero(misfit <= np.partition(misfit, max_kept - 1)[max_kept - 1])
     poses = loops.compute_edge_poses(a.xy, b.xy, edges_a, edges_b, matches, rows)
     # The order of hypotheses does not matter, apart from ties of the last one that is kept.
-    return poses if len(poses) <= most else poses[np.lexsort((*poses.T, misfit[rows]))[:most]]
+    return poses if len(poses) <= max_kept else poses[np.lexsort((*poses.T, misfit[rows]))[:max_kept]]
 
 
 def _edges(x: Landmarks, config: VoteConfig) -> loops.Edges:

@@ -51,7 +51,7 @@ class LiveMetrics:
         self.registry.register(self)
 
     def add(self, tick: LiveTick, num_neighbours: int) -> None:
-        """Count one tick."""
+        """Count one tick with its packets and neighbours."""
         self._tick, self._tick_s, self._neighbours = tick, self._monotonic(), num_neighbours
         new = (1, int(tick.missed), tick.sent_packets, tick.sent_bytes, int(tick.note.startswith("clock_step")))
         self._totals = {name: total + more for (name, total), more in zip(self._totals.items(), new)}

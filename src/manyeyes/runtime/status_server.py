@@ -38,7 +38,7 @@ class StatusServer:
         return int(self._server.server_address[1])
 
     def close(self) -> None:
-        """Stop serving."""
+        """Stop the server and close its socket."""
         self._server.shutdown()
         self._server.server_close()
 

@@ -67,6 +67,6 @@ class NuscenesExport:
         self.counts[step.method] += min(len(boxes), nuscenes_results.MAX_BOXES)
 
     def close(self) -> None:
-        """Write the files."""
+        """Write the files of all methods."""
         for method, samples in self._samples.items():
             nuscenes_results.write_results(self._out / method / NUSCENES_FILE, samples)

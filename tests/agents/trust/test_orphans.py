@@ -59,7 +59,7 @@ def find(fused: Boxes, sent: list[Message]) -> Orphans:
     return found
 
 
-def test_a_box_that_nobody_proposes_is_an_orphan_and_its_score_is_bounded():
+def test_a_box_that_no_agent_proposes_is_an_orphan_and_its_score_is_bounded():
     fused = cars(OWN, PROPOSED, *ORPHANS)
     sent = message(1, {PROPOSED: 2.0, ORPHANS[0]: -6.0, ORPHANS[1]: -6.0, ORPHANS[2]: -6.0})
     found = find_orphans(FRAME, fused, cache(OWN), [sent])

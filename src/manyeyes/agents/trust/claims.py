@@ -63,7 +63,7 @@ class Claims:
 
     @property
     def xy(self) -> Floats:
-        """Centres (N, 2)."""
+        """Centres of the claims (N, 2), metres."""
         return self.columns[:, :2]
 
     @property

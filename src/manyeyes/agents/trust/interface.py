@@ -64,7 +64,7 @@ class AssessedClaims:
 
     @property
     def agent_id(self) -> int:
-        """The sender."""
+        """Id of the sender of the claims."""
         return self.claims.agent_id
 
     @property
@@ -137,7 +137,7 @@ class MisbehaviourDetector(Protocol):
         ...
 
     def record_orphans(self, state: object | None, agent_ids: Collection[int]) -> object | None:
-        """Return the state after a fusion. agent_ids: senders of tokens near several fused boxes that nobody proposes
+        """Return the state after a fusion. agent_ids: senders of tokens near several fused boxes without a proposal
         (``agents.trust.orphans``). The same state by default.
         """
         return state

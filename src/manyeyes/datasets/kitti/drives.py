@@ -67,7 +67,7 @@ class ObjectFrame:
 
     @property
     def stem(self) -> str:
-        """The frame's number."""
+        """Number of the frame, as in file names."""
         return self.clouds[0].stem
 
     def timestamp_ns(self, index: int) -> int:

@@ -27,9 +27,9 @@ class Opv2vWriter:
     use. Snapshots come back with agents in string order of their ids, infrastructure (negative ids) last, and boxes in
     the order of ids.
 
-    OPV2V lists no agent's body as a vehicle (OpenCOOD, issue 141), so that readers of OPV2V count none as truth. The bodies that an
-    agent has seen are therefore written beside its ``vehicles``, under ``agent_bodies``, which :class:`Opv2vRecording` reads and
-    others skip. lists_agents: write them under ``vehicles``, as V2XSet does.
+    OPV2V lists no agent's body as a vehicle (OpenCOOD, number 141 of its tracker), so that readers of OPV2V count none as truth.
+    The bodies that an agent has seen are therefore written beside its ``vehicles``, under ``agent_bodies``, which
+    :class:`Opv2vRecording` reads and others skip. lists_agents: write them under ``vehicles``, as V2XSet does.
     """
 
     def __init__(

@@ -46,7 +46,7 @@ _CROSSWALK: Tags = (
 def write_lanelet2(vector_map: VectorMap, path: Path | str, drives_on_right: bool = True) -> None:
     """Write the published elements as an OSM file; ``local_x`` and ``local_y`` of a node are metres in the map's frame.
 
-    drives_on_right: the side of a double line on which traffic keeps, where no stop line tells the direction.
+    drives_on_right: the side of a double line on which traffic keeps, where no stop line gives the direction.
     """
     m = vector_map.select_published()
     writer = _Writer(m)

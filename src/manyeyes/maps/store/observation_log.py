@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """An append-only log of observations: Parquet segments that are never changed, and an index beside them.
 
-An entry is one file: a segment of observations (docs/reference/map-observations.md), a retraction, or what an
-ingest rejected; its name is its number and a hash of its content. An entry is written under another name, flushed and renamed,
-then indexed: a writer that is killed leaves the log without the entry or with it, and one that is there but not indexed is indexed when the log is opened
-to be written.
+An entry is one file: a segment of observations (docs/reference/map-observations.md), a retraction, or what an ingest rejected;
+its name is its number and a hash of its content. An entry is written under another name, flushed and renamed, then indexed: a
+writer that is killed leaves the log without the entry or with it, and one that is there but not indexed is indexed when the log
+is opened to be written.
 """
 
 from __future__ import annotations

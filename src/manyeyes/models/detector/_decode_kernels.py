@@ -77,8 +77,8 @@ def _min_heat(weight: float, threshold: float) -> float:  # pragma: no cover
     """Return a logit below which no score exceeds the threshold, with a margin for rounding: the IoU is at most 1."""
     if not (0.0 < threshold < 1.0 and 0.0 <= weight < 1.0):
         return -np.inf
-    least = threshold ** (1.0 / (1.0 - weight))
-    return np.log(least / (1.0 - least)) - 1e-3
+    min_heat = threshold ** (1.0 / (1.0 - weight))
+    return np.log(min_heat / (1.0 - min_heat)) - 1e-3
 
 
 @njit(cache=True, nogil=True)

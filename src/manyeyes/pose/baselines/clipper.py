@@ -4,7 +4,7 @@
 Lusk, Fathian and How, ICRA 2021. With the affinities M of consistent associations (1 on the diagonal) and the matrix C' of the
 inconsistent ones, u' M u is maximized over unit vectors u >= 0 that put no weight on two inconsistent associations. The constraint
 is a penalty d u' C' u whose factor d grows until it holds; projected gradient ascent, on the sphere, with step halving. As many of
-the largest entries of u are taken as the density u' M u says. Affinities are exp(-r^2 / 2 s^2) of the difference r of two edges'
+the largest entries of u are taken as the density u' M u states. Affinities are exp(-r^2 / 2 s^2) of the difference r of two edges'
 lengths. The optimum is a local one. No prior is used.
 """
 

@@ -69,7 +69,7 @@ class FaultyNetwork:
         return self._network.neighbours()
 
     def close(self) -> None:
-        """Close the network."""
+        """Close the network that carries the packets."""
         self._network.close()
 
     def _delay(self, received: ReceivedPacket) -> None:
