@@ -73,7 +73,7 @@ def redirect_links(text: str, folder: PurePosixPath) -> str:
 def split_pictures(text: str) -> str:
     """Replace pictures with a light and a dark form by two images, of which the site shows the one of its own theme."""
     return _PICTURE.sub(
-        r'<p><img alt="\2" src="\3#only-light"><img alt="\2" src="\1#only-dark"></p>',
+        r'<p class="plot"><img alt="\2" src="\3#only-light"><img alt="\2" src="\1#only-dark"></p>',
         text,
     )
 

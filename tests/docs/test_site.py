@@ -118,7 +118,7 @@ def test_lists_and_tables_after_a_paragraph_get_an_empty_line() -> None:
 def test_pictures_of_two_themes_become_images_of_the_theme_of_the_site() -> None:
     text = '<picture><source media="(prefers-color-scheme: dark)" srcset="a/x-dark.svg"><img alt="X" src="a/x-light.svg"></picture>'
     assert HOOKS.split_pictures(f"One\n\n{text}\n") == (
-        'One\n\n<p><img alt="X" src="a/x-light.svg#only-light"><img alt="X" src="a/x-dark.svg#only-dark"></p>\n'
+        'One\n\n<p class="plot"><img alt="X" src="a/x-light.svg#only-light"><img alt="X" src="a/x-dark.svg#only-dark"></p>\n'
     )
 
 

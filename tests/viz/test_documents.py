@@ -12,7 +12,7 @@ import pytest
 
 from manyeyes.cli.main import main
 from manyeyes.datatypes import ConfigError
-from manyeyes.viz.documents import END, find_documents, update_text
+from manyeyes.viz.documents import END, PLOTS, find_documents, update_text
 from manyeyes.viz.stored_tables import load_result, make_tables
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -312,4 +312,5 @@ def test_seeds_of_methods_become_one_table(root: Path) -> None:
 def test_the_documents_of_this_repository_are_those_of_their_results() -> None:
     documents = find_documents(ROOT)
     assert {"README.md", "fine-tune.md", "costr-small.md"} <= {document.path.name for document in documents}
+    assert {*(ROOT / PLOTS).iterdir()} == {document.path for document in documents if document.path.suffix == ".svg"}
     assert [str(document.path) for document in documents if document.text != document.updated] == []

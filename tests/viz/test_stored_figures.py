@@ -54,12 +54,18 @@ RESULTS: dict[str, dict[str, Any]] = {
     "robustness": ROBUSTNESS,
     "num-agents": {
         "rows": [
-            {"method": "late", "num_agents": n, "ap": [interval(0.5 + n / 10)], "gain_over_no_fusion": interval(n / 10)}
+            {"method": "late", "num_agents": n, "ap": [interval(0.5 + n / 10)], "gain_over_one_fewer": interval(n / 10)}
             for n in (2, 3)
         ]
     },
     "reliability": {
         "rows": [{"method": "late", "bins": [{"mean_score": s, "correct": interval(s)} for s in (0.2, 0.8)]}]
+    },
+    "attacks": {
+        "rows": [
+            {"attack": attack, "method": method, "defence": "none", "num_malicious": 1, "ap": [interval(0.5)]}
+            for attack, method in (("none", "no-fusion"), ("none", "late"), ("copy", "late"))
+        ]
     },
     "risk-coverage": {
         "nulls": [{"corrector": "voting", "kind": "other place", "risk_by_coverage": [0.0, 0.1, None, None]}]
@@ -153,7 +159,10 @@ def test_figures_are_written_beside_the_documents_and_checked(root: Path, capsys
     page = (root / "docs" / "more" / "p.md").read_text()
     assert 'srcset="../images/plots/ap-bytes-dev-test-dark.svg"' in page
     assert 'src="../images/plots/ap-bytes-dev-test-light.svg"' in page
-    assert "`manyeyes evaluate`, commit 0123456789ab, seed 0, split val." in page
+    assert (
+        "<summary>Command, commit, seed and split</summary>\n\n`manyeyes evaluate`, commit 0123456789ab, seed 0, split val."
+        in page
+    )
     assert main(["report", "docs", "--root", str(root), "--check"]) == 0
     picture = root / "docs/images/plots/ap-bytes-dev-test-dark.svg"
     picture.write_text(picture.read_text().replace("log2", "log3"))

@@ -76,8 +76,8 @@ def _draw_documents(words: Sequence[str], root: Path) -> Iterator[Document]:
 
 
 def _name_figure(words: Sequence[str], theme: str) -> str:
-    """Name the file of a figure: the figure, the first of its results if there are figures of others, and the theme."""
-    return f"{words[0]}-{Path(words[1]).stem.replace('_', '-')}-{theme}.svg"
+    """Name the file of a figure: the figure, its results and the theme."""
+    return "-".join((words[0], *(Path(name).stem.replace("_", "-") for name in words[1:]), f"{theme}.svg"))
 
 
 def update_text(text: str, results: Path, name: str) -> str:
@@ -158,7 +158,9 @@ def _make_figure(words: Sequence[str], results: Path, name: str) -> Iterator[str
         f'<picture><source media="(prefers-color-scheme: dark)" srcset="{dark}"><img alt="{figure.text}" src="{light}">'
         "</picture>\n"
     )
+    yield '<details markdown="1"><summary>Command, commit, seed and split</summary>\n'
     yield from (f"{load_result(results / file).origin}\n" for file in words[1:])
+    yield "</details>\n"
 
 
 def _make_seed_parts(words: Sequence[str], results: Path, name: str) -> Iterator[str]:

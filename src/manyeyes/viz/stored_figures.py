@@ -149,7 +149,7 @@ def _make_num_agents(results: Sequence[StoredResult]) -> list[Panel]:
 
     return [
         make_panel("Scenarios that have as many", _IOUS[0], lambda row: row["ap"][0]),
-        make_panel("The same scenarios", f"gain of {_IOUS[0]} over no fusion", lambda row: row["gain_over_no_fusion"]),
+        make_panel("The same scenarios", f"gain of {_IOUS[0]} over one fewer", lambda row: row["gain_over_one_fewer"]),
     ]
 
 
@@ -275,6 +275,33 @@ def _make_map_cost(results: Sequence[StoredResult]) -> list[Panel]:
     return [make_panel("seconds", "CPU time [s]"), make_panel("peak_mib", "peak memory [MiB]")]
 
 
+def _make_attacks(results: Sequence[StoredResult]) -> list[Panel]:
+    rows = [row for stored in results for row in stored.result["rows"] if row["num_malicious"] == 1]
+    alone = [row for row in rows if row["method"] == "no-fusion" and row["attack"] == "none"]
+    played = [row for row in rows if row["method"] != "no-fusion"]
+    attacks = list(dict.fromkeys(row["attack"] for row in played))[::-1]
+    defences = list(dict.fromkeys(row["defence"] for row in played))
+
+    def draw(axes: Any, theme: Theme) -> None:
+        for place, defence in enumerate(defences):
+            mine = [row for row in played if row["defence"] == defence]
+            values = [row["ap"][0]["value"] for row in mine]
+            errors = [
+                [row["ap"][0]["value"] - row["ap"][0]["low"] for row in mine],
+                [row["ap"][0]["high"] - row["ap"][0]["value"] for row in mine],
+            ]
+            y = [attacks.index(row["attack"]) + 0.22 * ((len(defences) - 1) / 2 - place) for row in mine]
+            axes.errorbar(
+                values, y, xerr=errors, color=theme.series_colour(place), marker="o", ms=4, capsize=2, ls="none",
+                label=f"defence: {defence}",
+            )  # fmt: skip
+        if alone:
+            axes.axvline(alone[0]["ap"][0]["value"], color=theme.text, lw=1.0, ls="--", label="ego alone")
+        axes.set_yticks(range(len(attacks)), attacks)
+
+    return [Panel("", f"{_IOUS[0]}, 95 % interval over scenarios", "", draw)]
+
+
 _EVALUATE = "manyeyes evaluate --data data/carla-towns-small --split test"
 FIGURES = {
     "ap-bytes": StoredFigure("AP against log2(bytes per message), by method", _EVALUATE, _make_ap_bytes),
@@ -293,6 +320,12 @@ FIGURES = {
         "Fraction of correct boxes against their score",
         "python benchmarks/reliability.py --data data/carla-towns-small --split test",
         _make_reliability,
+    ),
+    "attacks": StoredFigure(
+        "AP under attacks, by defence",
+        "manyeyes study attacks --data data/carla-towns-small --split val",
+        _make_attacks,
+        height_in=5.2,
     ),
     "risk-coverage": StoredFigure(
         "Risk against coverage of pose correctors without a prior",
