@@ -107,6 +107,11 @@ def test_a_figure_is_the_same_text_on_every_run_and_differs_by_theme(name: str) 
     assert LIGHT.text in light and LIGHT.text not in dark and DARK.text in dark
 
 
+def test_ten_series_have_ten_colours() -> None:
+    for theme in THEMES:
+        assert len({theme.series_colour(place) for place in range(10)}) == 10
+
+
 def shown_texts(name: str) -> list[str]:
     return re.findall(r"<text[^>]*>([^<]+)</text>", draw_figure(name, [stored(RESULTS[name])], LIGHT))
 
