@@ -20,6 +20,7 @@ import tyro
 
 from manyeyes._lazy import Definition, find_public_names
 from manyeyes.agents.strategies.registry import list_strategies
+from manyeyes.cli.arguments import PARSER_CONFIG
 from manyeyes.cli.main import COMMAND_GROUPS, COMMANDS, Command, load_command
 from manyeyes.comms.channel import CHANNELS
 from manyeyes.evaluation.detection.protocols import PROTOCOLS
@@ -51,9 +52,7 @@ def list_options(command: Command) -> list[tuple[str, str, str, str]]:
     """List name, values, default and help of each option of a command, as the parser has them."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
-        parser = tyro.extras.get_parser(
-            command.options, config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
-        )
+        parser = tyro.extras.get_parser(command.options, config=PARSER_CONFIG)
     out = []
     for action in parser._actions:
         name = ", ".join(f"`{option}`" for option in action.option_strings) or f"`{action.metavar}`"
@@ -63,7 +62,7 @@ def list_options(command: Command) -> list[tuple[str, str, str, str]]:
         default = default.removesuffix(")").removeprefix("default: ")
         metavar = action.metavar if isinstance(action.metavar, str) and action.option_strings else ""
         if not metavar and action.option_strings:
-            default = ""  # a flag
+            default = {"True": "on", "False": "off"}[default]  # a flag
         metavar = metavar.replace("{None}|", "").replace("None,", "").replace("|", " or ")
         out.append((name, f"`{metavar}`" if metavar else "", f"`{default}`" if default else "", escape(text)))
     return out

@@ -13,6 +13,8 @@ import tyro
 
 from manyeyes.cli.bounds import find_violation
 
+PARSER_CONFIG = (tyro.conf.OmitArgPrefixes,)
+"""Settings of every parser. A flag is a pair, --animate and --no-animate: help and default both speak of what is on."""
 _COLOUR = re.compile("\x1b\\[[0-9;]*m")
 _FRAME = re.compile("[│╭╮╰╯]|[─-]{3,}")
 """What tyro draws around an error: sides of a box, and rules, of hyphens where the encoding is not UTF-8."""
@@ -34,8 +36,9 @@ def parse_options(options_type: Any, prog: str, description: str | None, argumen
     errors = io.StringIO()
     try:
         with contextlib.redirect_stderr(errors):
-            config = (tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff)
-            options = tyro.cli(options_type, args=list(arguments), prog=prog, description=description, config=config)
+            options = tyro.cli(
+                options_type, args=list(arguments), prog=prog, description=description, config=PARSER_CONFIG
+            )
     except SystemExit as stop:
         if not stop.code:
             raise
@@ -50,7 +53,10 @@ def _summarize_error(box: str) -> str:
     lines = (_FRAME.sub("", line).strip() for line in _COLOUR.sub("", box).splitlines())
     message, *hints = "\n".join(lines).partition("\n")[2].strip().split("\n\n")
     names = [
-        name for hint in hints if hint.startswith("Perhaps") for name in re.findall(r"^--[\w-]+", hint, re.MULTILINE)
+        name
+        for hint in hints
+        if hint.startswith("Perhaps")
+        for name in re.findall(r"^--[\w-]+(?:, --no-[\w-]+)?", hint, re.MULTILINE)
     ]
     message = message.replace("\n", " ").rstrip(".")
     return f"{message}; did you mean {' or '.join(names)}?" if names else f"{message}."

@@ -57,8 +57,8 @@ class Options:
     """Standard deviation of errors of collaborators' prior positions."""
     noise_yaw_deg: AngleDeg = 0.0
     """Standard deviation of errors of collaborators' prior headings, degrees."""
-    no_prior: bool = False
-    """Correctors get no prior pose."""
+    prior: bool = True
+    """Correctors get the prior pose."""
     min_score: Fraction = 0.3
     """Detections below this score are no landmarks."""
     weights: str = "costr-small"
@@ -178,7 +178,7 @@ def _run_correctors(
             for name in names
         }
         for row in range(1, len(perturbed.frames)):
-            prior = None if options.no_prior else PosePrior.between(perturbed.frames[0], perturbed.frames[row])
+            prior = PosePrior.between(perturbed.frames[0], perturbed.frames[row]) if options.prior else None
             for name, agent_inputs in inputs.items():
                 estimate = correctors[name].function(agent_inputs[0], agent_inputs[row], prior)
                 counts, other = (len(agent_inputs[0]), len(agent_inputs[row])), perturbed.frames[row]
