@@ -18,7 +18,8 @@ pytest.importorskip("mcap", reason="the extra live is not installed")
 from mcap.reader import make_reader
 
 from manyeyes.datatypes import Boxes, Transform
-from manyeyes.viz.foxglove_log import MAX_POINTS, FoxgloveLog
+from manyeyes.viz.foxglove_log import FoxgloveLog
+from manyeyes.viz.spatial_entities import MAP_COLORS, MAX_POINTS, shade_by_agent, shade_by_intensity
 from manyeyes.viz.spatial_frame import BOX_COLORS, ShownAgent, ShownBoxes, ShownLink, SpatialFrame
 
 START_NS = 1_800_000_000 * 10**9
@@ -49,10 +50,15 @@ def make_frame(index: int = 0) -> SpatialFrame:
 
 
 def write(path: Path, *frames: SpatialFrame) -> dict[str, list[tuple[str, int, dict]]]:
-    """Messages by topic: schema, time and content."""
+    """Write frames, and read them back."""
     with FoxgloveLog(path) as log:
         for frame in frames:
             log.add(frame)
+    return read(path)
+
+
+def read(path: Path) -> dict[str, list[tuple[str, int, dict]]]:
+    """Messages by topic: schema, time and content."""
     found: dict[str, list[tuple[str, int, dict]]] = {}
     with path.open("rb") as stream:
         for schema, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
@@ -60,6 +66,14 @@ def write(path: Path, *frames: SpatialFrame) -> dict[str, list[tuple[str, int, d
             assert json.loads(schema.data)["type"] == "object"
             found.setdefault(channel.topic, []).append((schema.name, message.log_time, json.loads(message.data)))
     return found
+
+
+def read_cloud(cloud: dict) -> np.ndarray:
+    """Points as rows, by the fields that the message states."""
+    kinds = {1: "u1", 7: "<f4"}
+    names, offsets, types = zip(*((f["name"], f["offset"], kinds[f["type"]]) for f in cloud["fields"]))
+    layout = {"names": names, "formats": types, "offsets": offsets, "itemsize": cloud["point_stride"]}
+    return np.frombuffer(base64.b64decode(cloud["data"]), np.dtype(layout))
 
 
 def test_every_quantity_has_its_topic_and_schema(tmp_path) -> None:
@@ -92,11 +106,36 @@ def test_boxes_have_place_heading_colour_and_score(tmp_path) -> None:
 def test_clouds_are_floats_in_the_frame_of_their_agent(tmp_path) -> None:
     found = write(tmp_path / "run.mcap", make_frame())
     cloud = found["/agents/1/cloud"][0][2]
-    rows = np.frombuffer(base64.b64decode(cloud["data"]), "<f4").reshape(-1, 4)
-    assert cloud["frame_id"] == "agent_1" and cloud["point_stride"] == 16
-    assert np.array_equal(rows[:, :3], np.arange(12).reshape(4, 3)) and rows[:, 3].tolist() == [0.0, 0.5, 1.0, 2.0]
+    rows = read_cloud(cloud)
+    assert cloud["frame_id"] == "agent_1" and cloud["point_stride"] == 20
+    assert np.array_equal(np.stack([rows[name] for name in "xyz"], 1), np.arange(12).reshape(4, 3))
+    assert rows["intensity"].tolist() == [0.0, 0.5, 1.0, 2.0] and rows["alpha"].tolist() == [255] * 4
     transforms = {one["child_frame_id"]: one for _, _, one in found["/tf"]}
     assert transforms["agent_2"]["translation"] == pytest.approx({"x": 11.0, "y": 2.0, "z": 0.0})
+
+
+@pytest.mark.parametrize("cloud_color", ["agent", "intensity"])
+def test_points_have_the_colour_of_their_agent_or_of_their_intensity(tmp_path, cloud_color) -> None:
+    with FoxgloveLog(tmp_path / "run.mcap", cloud_color) as log:
+        log.add(make_frame())
+    rows = read_cloud(read(tmp_path / "run.mcap")["/agents/1/cloud"][0][2])
+    intensity = np.array([0.0, 0.5, 1.0, 2.0], np.float32)
+    shades = {"agent": shade_by_agent((90, 170, 255), intensity), "intensity": shade_by_intensity(intensity)}
+    assert np.array_equal(np.stack([rows[name] for name in ("red", "green", "blue")], 1), shades[cloud_color])
+
+
+def test_map_elements_are_coloured_by_kind_and_written_again_only_when_they_change(tmp_path) -> None:
+    frame = make_frame()
+    found = write(tmp_path / "run.mcap", frame, replace(frame, index=1), replace(frame, map_lines={}))
+    first, gone = (update["entities"] for _, _, update in found["/map"])
+    red, green, blue = (value / 255 for value in MAP_COLORS["divider"])
+    assert first[0]["lines"][0]["color"] == pytest.approx({"r": red, "g": green, "b": blue, "a": 1.0}) and gone == []
+
+
+def test_the_cloud_of_an_agent_that_left_is_emptied(tmp_path) -> None:
+    frame = make_frame()
+    found = write(tmp_path / "run.mcap", frame, replace(frame, agents=frame.agents[1:]), replace(frame, agents=()))
+    assert [len(read_cloud(cloud)) for _, _, cloud in found["/agents/1/cloud"]] == [4, 0]
 
 
 @pytest.mark.parametrize("rpy", [(0.0, 0.0, 0.0), (0.1, -0.2, 3.0), (3.1, 0.1, -0.4), (0.2, 1.5, 0.3), (0.0, 3.1, 3.1)])
@@ -125,7 +164,7 @@ def test_of_a_long_cloud_every_nth_point_is_written(tmp_path) -> None:
     points = np.zeros((2 * MAX_POINTS + 1, 3), np.float32)
     frame = replace(make_frame(), agents=(ShownAgent(1, Transform.identity(), points),))
     cloud = write(tmp_path / "run.mcap", frame)["/agents/1/cloud"][0][2]
-    assert len(base64.b64decode(cloud["data"])) == 16 * -(-len(points) // 3)
+    assert len(read_cloud(cloud)) == -(-len(points) // 3)
 
 
 def test_after_an_error_there_is_no_file(tmp_path) -> None:

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import socket
+import urllib.request
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +17,9 @@ pytest.importorskip("rerun", reason="the extra rerun is not installed")
 import rerun
 
 from manyeyes.datatypes import Boxes, ConfigError, Transform
-from manyeyes.viz.rerun_log import MAX_POINTS, RerunLog
+from manyeyes.viz.rerun_log import RerunLog
+from manyeyes.viz.rerun_server import RerunServer
+from manyeyes.viz.spatial_entities import LINK_HEIGHT_M, MAX_POINTS, shade_by_intensity
 from manyeyes.viz.spatial_frame import (
     BOX_COLORS,
     ShownAgent,
@@ -117,6 +122,83 @@ def test_long_clouds_are_thinned_and_a_failed_log_leaves_no_file(tmp_path: Path)
     assert [p.name for p in tmp_path.iterdir()] == ["a.rrd"]
     with pytest.raises(ConfigError, match=r"\.rrd"):
         RerunLog("drive.png")
+
+
+def test_what_an_instant_no_longer_has_is_cleared(tmp_path: Path) -> None:
+    frame = make_frame()
+    with RerunLog(str(tmp_path / "a.rrd")) as log:
+        log.add(frame)
+        log.add(replace(frame, index=1, agents=frame.agents[:1], links=()))
+        log.add(replace(frame, index=2, agents=frame.agents[:1], links=()))
+    found = read_back(tmp_path / "a.rrd")
+    for path in ("/world/agents/2", "/world/corrections/2", "/world/links/2-1"):
+        cleared = [chunk for chunk in found[path] if "Clear:is_recursive" in chunk.to_record_batch().schema.names]
+        assert column(cleared, "tick") == [1] and column(cleared, "Clear:is_recursive") == [[True]], path
+    assert "Clear:is_recursive" not in str([c.to_record_batch().schema.names for c in found["/world/agents/1"]])
+    # A map that did not change is logged once, and stays.
+    assert column(found["/world/map/divider"], "tick") == [0]
+
+
+def test_links_lie_above_the_road_and_are_wider_by_bytes(tmp_path: Path) -> None:
+    sizes = {0: 100, 1: 10_000, 2: 1_000_000}
+    with RerunLog(str(tmp_path / "a.rrd")) as log:
+        for index, num_bytes in sizes.items():
+            log.add(replace(make_frame(index), links=(ShownLink(2, 1, num_bytes, 80.0),)))
+    links = read_back(tmp_path / "a.rrd")["/world/links/2-1"]
+    assert [radii[0] for radii in column(links, "LineStrips3D:radii")] == pytest.approx([0.02, 0.1, 0.3])
+    assert column(links, "LineStrips3D:strips")[0] == [[[11.0, 2.0, LINK_HEIGHT_M], [1.0, 2.0, LINK_HEIGHT_M]]]
+
+
+def test_points_are_coloured_by_intensity_on_request_and_true_poses_are_arrows(tmp_path: Path) -> None:
+    frame = make_frame()
+    agent = replace(frame.agents[0], true_pose=Transform.from_xyz_yaw(1.0, 5.0, 0.0, 0.1))
+    with RerunLog(str(tmp_path / "a.rrd"), cloud_color="intensity") as log:
+        log.add(replace(frame, agents=(agent,)))
+    found = read_back(tmp_path / "a.rrd")
+    (colors,) = column(found["/world/agents/1/cloud"], "Points3D:colors")
+    shades = shade_by_intensity(np.array([0.0, 0.5, 1.0, 2.0], np.float32)).astype(np.int64)
+    assert colors == [(r << 24) + (g << 16) + (b << 8) + 255 for r, g, b in shades.tolist()]
+    assert shades[0].sum() < shades[1].sum() < shades[2].sum() and shades[2].tolist() == shades[3].tolist()
+    arrows = found["/world/pose_errors/1"]
+    assert column(arrows, "Arrows3D:vectors") == [[[0.0, 3.0, 0.0]]]
+    assert column(arrows, "Arrows3D:labels") == [["agent 1: 3.00 m, 5.73 deg"]]
+
+
+def test_plots_have_the_colours_of_agents_and_of_kinds_of_boxes(tmp_path: Path) -> None:
+    with RerunLog(str(tmp_path / "a.rrd")) as log:
+        log.add(replace(make_frame(), numbers={"counts/missed": 3.0, "bytes/2": 5.0, "level": 0.0}))
+    found = read_back(tmp_path / "a.rrd")
+    for path, (r, g, b) in {"/plots/counts/missed": BOX_COLORS["missed"], "/plots/bytes/2": (255, 170, 60)}.items():
+        assert column(found[path], "SeriesLines:colors") == [[(r << 24) + (g << 16) + (b << 8) + 255]]
+    assert column(found["/plots/level"], "SeriesLines:colors") == []
+
+
+@pytest.mark.parametrize(
+    "target",
+    ["web:", "web:0", "web:65536", "web:no", "rerun+http://127.0.0.1:1/proxy", "rerun+http:no", "rerun+http://:x"],
+)
+def test_a_target_that_cannot_be_is_an_error(target: str) -> None:
+    with pytest.raises(ConfigError, match=r"from 1 to 65535|no viewer answers"):
+        RerunLog(target)
+
+
+@pytest.mark.slow
+def test_the_web_viewer_serves_this_machine_alone_and_ends_with_its_log() -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = int(probe.getsockname()[1])
+    with RerunLog(f"web:{port}") as log:
+        log.add(make_frame())
+        assert isinstance(log.server, RerunServer) and log.server.page.startswith(f"http://127.0.0.1:{port}/?url=")
+        with urllib.request.urlopen(log.server.page) as page:
+            assert page.status == 200 and b"wasm" in page.read()
+        with pytest.raises(ConfigError, match=f"Port {port} of 127.0.0.1 is taken"):
+            RerunLog(f"web:{port}")
+        # Another address of this machine, loopback too: nothing listens there.
+        with pytest.raises(ConnectionRefusedError):
+            socket.create_connection(("127.0.0.2", port), timeout=5.0)
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", port), timeout=5.0)
 
 
 def test_each_true_box_is_matched_once_and_the_others_are_errors() -> None:

@@ -96,6 +96,7 @@ def _run_demo(options: Options) -> None:
             f"manyeyes replay {folder} --split test --channel {options.replay_options.channel} --methods "
             + " ".join(options.replay_options.methods),
             f"manyeyes view {folder} --split test --out drive.gif",
+            f"manyeyes view {folder} --split test --detect intermediate-temporal --rerun drive.rrd",
             f"manyeyes map fuse {options.out / 'map'}",
         ),
     )

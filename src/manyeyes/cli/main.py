@@ -25,7 +25,7 @@ COMMANDS = {
     "evaluate": "evaluate methods on a split: AP with intervals, bytes, paired differences",
     "replay": "replay your own recording as demo does",
     "export": "export detections to the result files of KITTI or nuScenes",
-    "view": "draw a frame of a recording, or animate a drive",
+    "view": "draw a frame of a recording, animate a drive, or log it for the viewers rerun and Foxglove",
     "pose": "evaluate pose correction from detected objects: prior and corrected poses",
     "map": "one map from many drives: build, simulate, fuse, evaluate, diff, export, view, import, retract",
     "live": "agents as processes on a network: run one, demo of a team, map server, replay of a recorded run",

@@ -35,12 +35,18 @@ class Requirement:
     option: the field of the command's Options that decides whether it imports them, with dots in a nested one; without one it
     always does.
     patterns: the values of that option for which it does, as of fnmatch; an option that is None matches none.
+    replaced_by: options that make the command do something else instead: with any of them it imports none.
     """
 
     extra: str
     modules: tuple[str, ...]
     option: str = ""
     patterns: tuple[str, ...] = ()
+    replaced_by: tuple[str, ...] = ()
+
+    def unless(self, *options: str) -> Requirement:
+        """Return the same requirement without any of these options only."""
+        return replace(self, replaced_by=options)
 
     def when(self, option: str, *patterns: str) -> Requirement:
         """Return the same requirement for some values of an option only."""
@@ -48,6 +54,8 @@ class Requirement:
 
     def applies(self, options: Any) -> bool:
         """Return whether a command with these options imports the modules."""
+        if any(getattr(options, name) is not None for name in self.replaced_by):
+            return False
         if not self.option:
             return True
         value = attrgetter(self.option)(options)
@@ -93,7 +101,13 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
     "evaluate": (),
     "replay": (Requirement("view", EXTRAS["view"]),),
     "export": (),
-    "view": (_PILLOW, Requirement("rerun", EXTRAS["rerun"]).when("rerun", "*")),
+    "view": (
+        _PILLOW.unless("rerun", "mcap"),
+        Requirement("rerun", EXTRAS["rerun"]).when("rerun", "*"),
+        _MCAP.when("mcap", "*"),
+        _ARROW.when("map", "*"),
+        _SHAPELY.when("map", "*"),
+    ),
     "pose": (_GICP,),
     "doctor": (),
     "report docs": (_MATPLOTLIB,),

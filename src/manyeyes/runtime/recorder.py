@@ -19,7 +19,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -167,17 +167,37 @@ def read_events(path: Path) -> Iterator[Event]:
     Raises:
         RecordingError: the file is no recording of a live run, or is damaged.
     """
-    reader, errors = (
-        import_extra("mcap.reader", "live", _PURPOSE),
-        import_extra("mcap.exceptions", "live", _PURPOSE),
-    )
-    with path.open("rb") as stream:
-        try:
-            messages = reader.make_reader(stream, validate_crcs=True).iter_messages(log_time_order=True)
-            for _, channel, message in messages:
-                yield _read_event(channel.topic, message.data)
-        except (errors.McapError, ValueError, KeyError, TypeError, struct.error, SafetensorError) as error:
-            raise RecordingError(f"{path}: no whole recording of a live run ({error}); record it again.") from error
+    reader = import_extra("mcap.reader", "live", _PURPOSE)
+    with path.open("rb") as stream, _name_damage(path):
+        messages = reader.make_reader(stream, validate_crcs=True).iter_messages(log_time_order=True)
+        for _, channel, message in messages:
+            yield _read_event(channel.topic, message.data)
+
+
+@contextmanager
+def _name_damage(path: Path) -> Iterator[None]:
+    """Raise RecordingError for what the reader raises on a file that is damaged, cut, or another one."""
+    errors = import_extra("mcap.exceptions", "live", _PURPOSE)
+    try:
+        yield
+    except (errors.McapError, OSError, ValueError, KeyError, TypeError, struct.error, SafetensorError) as error:
+        raise RecordingError(f"{path}: no whole recording of a live run ({error}); record it again.") from error
+
+
+def count_ticks(path: Path) -> int | None:
+    """Return the number of perceptions of a recording, as its summary states it; None without one.
+
+    Raises:
+        RecordingError: the file is no recording of a live run, or is damaged.
+    """
+    reader = import_extra("mcap.reader", "live", _PURPOSE)
+    with path.open("rb") as stream, _name_damage(path):
+        summary = reader.make_reader(stream).get_summary()
+    if summary is None or summary.statistics is None:
+        return None
+    topics = {key: channel.topic for key, channel in summary.channels.items()}
+    counts = summary.statistics.channel_message_counts
+    return sum(count for key, count in counts.items() if topics.get(key) == "/tick")
 
 
 def _pack_event(event: Event) -> tuple[str, bytes]:

@@ -3,40 +3,92 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Protocol
 
+import numpy as np
 import torch
 
 from manyeyes.agents.agent import Agent, Perception
 from manyeyes.agents.replay import ReplayStep
 from manyeyes.comms.inbox import ReceivedMessage
-from manyeyes.datatypes import AgentFrame, Boxes, Snapshot, Transform
-from manyeyes.datatypes.map_element import KINDS
+from manyeyes.datasets.base import Recording
+from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, Snapshot, Transform
+from manyeyes.datatypes.map_element import KINDS, MapElements
 from manyeyes.runtime.recorder import RunConfig
 from manyeyes.runtime.replay import ReplayedTick, replay_run
+from manyeyes.studies.map_folder import read_vector_map
+from manyeyes.studies.town_maps import group_by_town
+from manyeyes.viz.spatial_entities import measure_pose_difference
 from manyeyes.viz.spatial_frame import Floats, ShownAgent, ShownBoxes, ShownLink, SpatialFrame, mark_errors
 
+MapLines = Mapping[str, tuple[Floats, ...]]
+MIN_DIFFERENCE_M, MIN_DIFFERENCE_DEG = 1e-3, 1e-3
+"""Poses that differ by less are shown as one: messages hold poses as rounded numbers."""
 _EVIDENCE = ("unchecked", "supported", "corroborated", "disputed", "refuted", "own")
 """Kinds by the value of ``agents.trust.interface.Evidence``."""
 
 
+class SpatialLog(Protocol):
+    """Where frames are logged: ``viz.rerun_log.RerunLog``, ``viz.foxglove_log.FoxgloveLog``."""
+
+    def add(self, frame: SpatialFrame) -> None:
+        """Log one instant."""
+        ...
+
+
+def log_frames(frames: Iterable[SpatialFrame], logs: Sequence[SpatialLog], advance: Callable[[], None]) -> int:
+    """Log frames to all logs, each frame computed once; return their number. advance: called after each frame."""
+    num = 0
+    for frame in frames:
+        for log in logs:
+            log.add(frame)
+        advance()
+        num += 1
+    return num
+
+
+def read_map_lines(recording: Recording, scenario: str, folder: Path) -> MapLines:
+    """Return the published elements of a map in the world of a scenario, by kind.
+
+    Args:
+        recording: what the map was built of, which places it: a map is stated about its town's, or the first agent's, position.
+        scenario: which of its scenarios.
+        folder: of the map, as ``manyeyes map fuse`` writes it.
+    """
+    vector_map = read_vector_map(folder)
+    (town_map,) = group_by_town(recording, (scenario,), scenario)
+    return _lines_by_kind([vector_map.select_published().elements.transform(*town_map.origin_xy, 0.0)])
+
+
 def show_snapshot(snapshot: Snapshot) -> SpatialFrame:
-    """Return a snapshot without detections: clouds, poses, and true boxes."""
+    """Return a snapshot without detections: clouds, claimed and true poses, and true boxes."""
     truth = None
     if snapshot.truth is not None:
         boxes = snapshot.truth.boxes
         truth = ShownBoxes(boxes, ("truth",) * len(boxes))
-    agents = tuple(_show_agent(frame) for frame in snapshot.frames)
+    agents = _show_agents(snapshot, {})
     ego = snapshot.frames[0]
-    return SpatialFrame(snapshot.index, ego.timestamp_ns, agents, ShownBoxes(Boxes.empty(), ()), truth)
+    no_boxes = ShownBoxes(Boxes.empty(), ())
+    return SpatialFrame(snapshot.index, ego.timestamp_ns, agents, no_boxes, truth, numbers=_pose_numbers(agents))
 
 
-def show_step(step: ReplayStep, min_score: float = 0.0) -> SpatialFrame:
-    """Return one step of a replay: boxes marked against the truth where it is known, and messages with bytes and age."""
+def show_step(step: ReplayStep, min_score: float = 0.0, detection_range: BevGrid | None = None) -> SpatialFrame:
+    """Return one step of a replay: boxes marked against the truth where it is known, and messages with bytes and age.
+
+    detection_range: about the ego; vehicles beyond it cannot be found, and are not marked as missed.
+    """
     snapshot, ego = step.snapshot, step.snapshot.frames[step.ego]
-    corrected = {one.message.agent_id: one.message.world_from_agent for one in step.perception.received}
-    agents = tuple(_show_agent(frame, corrected.get(frame.agent_id)) for frame in snapshot.frames)
+    times_ns = {frame.agent_id: frame.timestamp_ns for frame in snapshot.frames}
+    # The pose in an older message is that of an older sweep: it is no correction of the present one.
+    corrected = {
+        one.message.agent_id: one.message.world_from_agent
+        for one in step.perception.received
+        if step.perception.corrections and one.message.timestamp_ns == times_ns.get(one.message.agent_id)
+    }
+    agents = _show_agents(snapshot, corrected)
     sent = {one.agent_id: one.num_bytes for one in step.sent}
     links = tuple(
         ShownLink(
@@ -45,14 +97,18 @@ def show_step(step: ReplayStep, min_score: float = 0.0) -> SpatialFrame:
         for one, age_s in zip(step.perception.received, step.ages_s)
     )
     numbers = {f"bytes/{agent_id}": float(count) for agent_id, count in sent.items()}
-    numbers |= {f"age_ms/{link.sender}": link.age_ms for link in links}
+    numbers |= {f"age_ms/{link.sender}": link.age_ms for link in links} | _pose_numbers(agents)
     numbers |= {"stage_ms/perceive": 1e3 * step.perceive_seconds} | _numbers_of(step.perception)
     boxes, truth = _show_boxes(step.perception, ego, min_score), None
     if snapshot.truth is not None:
         listed = snapshot.truth.of_classes()
         others = listed.boxes[listed.seen.any(0) & (listed.boxes.id != ego.agent_id)]
         kinds, true_kinds = mark_errors(boxes.boxes, others)
+        inside = _find_inside(others, ego, detection_range)
+        true_kinds = tuple(kind if near else "truth" for kind, near in zip(true_kinds, inside))
         boxes, truth = ShownBoxes(boxes.boxes, kinds), ShownBoxes(others, true_kinds)
+        marks = (*kinds, *true_kinds)
+        numbers |= {f"counts/{kind}": float(marks.count(kind)) for kind in ("matched", "false", "missed")}
     return SpatialFrame(
         snapshot.index, ego.timestamp_ns, agents, boxes, truth, links, {}, numbers, _events_of(step.perception)
     )
@@ -64,11 +120,16 @@ def show_run(path: Path, make_agent: Callable[[RunConfig], Agent], min_score: fl
     Raises:
         RecordingError: the file is no whole recording of a live run.
     """
+    local_maps, map_lines = dict[int, MapElements](), dict[str, tuple[Floats, ...]]()
     for index, tick in enumerate(replay_run(path, make_agent)):
-        yield _show_tick(index, tick, min_score)
+        # A local map comes with few messages; the latest one of each sender is shown until the next.
+        if received := _place_local_maps(tick.perception.received):
+            local_maps |= received
+            map_lines = _lines_by_kind(local_maps.values())
+        yield _show_tick(index, tick, map_lines, min_score)
 
 
-def _show_tick(index: int, tick: ReplayedTick, min_score: float) -> SpatialFrame:
+def _show_tick(index: int, tick: ReplayedTick, map_lines: MapLines, min_score: float) -> SpatialFrame:
     frame, perception = tick.frame, tick.perception
     received = {one.message.agent_id: one for one in perception.received}
     agents = [_show_agent(frame)]
@@ -89,23 +150,57 @@ def _show_tick(index: int, tick: ReplayedTick, min_score: float) -> SpatialFrame
         _show_boxes(perception, frame, min_score),
         None,
         tuple(links),
-        _map_lines(perception.received),
+        map_lines,
         numbers | {"level": float(tick.level)} | _numbers_of(perception),
         events,
+    )
+
+
+def _find_inside(boxes: Boxes, ego: AgentFrame, detection_range: BevGrid | None) -> list[bool]:
+    """Return for each box in the world whether its centre lies in the range about the ego, seen from above."""
+    if detection_range is None:
+        return [True] * len(boxes)
+    x, y, _ = ego.world_from_agent.inverse().apply(boxes.center.double()).unbind(-1)
+    r = detection_range
+    return ((x >= r.x_min) & (x <= r.x_max) & (y >= r.y_min) & (y <= r.y_max)).tolist()
+
+
+def _show_agents(snapshot: Snapshot, corrected: Mapping[int, Transform]) -> tuple[ShownAgent, ...]:
+    agents = [_show_agent(frame, corrected.get(frame.agent_id)) for frame in snapshot.frames]
+    if snapshot.truth is None:
+        return tuple(agents)
+    true_poses = snapshot.truth.world_from_agent
+    return tuple(
+        replace(agent, true_pose=_moved(agent.world_from_agent, true_poses[row])) for row, agent in enumerate(agents)
     )
 
 
 def _show_agent(frame: AgentFrame, corrected: Transform | None = None) -> ShownAgent:
     points = frame.points
     intensity = points.intensity.reshape(-1).float().cpu().numpy()
-    stated = frame.world_from_agent
-    moved = None if corrected is None else _moved(stated, corrected)
-    return ShownAgent(frame.agent_id, stated, points.xyz.float().cpu().numpy(), intensity, moved)
+    claimed = frame.world_from_agent
+    moved = None if corrected is None else _moved(claimed, corrected)
+    return ShownAgent(frame.agent_id, claimed, points.xyz.float().cpu().numpy(), intensity, moved)
 
 
-def _moved(stated: Transform, corrected: Transform) -> Transform | None:
-    """Return the corrected pose where it differs from the stated one."""
-    return None if torch.equal(stated.translation.double(), corrected.translation.double()) else corrected
+def _moved(claimed: Transform, other: Transform) -> Transform | None:
+    """Return the other pose where it differs from the claimed one."""
+    distance_m, turn_deg = measure_pose_difference(claimed, other)
+    return other if distance_m > MIN_DIFFERENCE_M or turn_deg > MIN_DIFFERENCE_DEG else None
+
+
+def _pose_numbers(agents: Sequence[ShownAgent]) -> dict[str, float]:
+    """Return the distances of claimed and corrected poses from the true ones, metres, where they differ."""
+    numbers: dict[str, float] = {}
+    for agent in agents:
+        if agent.true_pose is not None:
+            numbers[f"pose_error_m/claimed/{agent.agent_id}"] = measure_pose_difference(
+                agent.world_from_agent, agent.true_pose
+            )[0]
+            if agent.corrected is not None:
+                distance_m, _ = measure_pose_difference(agent.corrected, agent.true_pose)
+                numbers[f"pose_error_m/corrected/{agent.agent_id}"] = distance_m
+    return numbers
 
 
 def _show_boxes(perception: Perception, frame: AgentFrame, min_score: float) -> ShownBoxes:
@@ -132,16 +227,24 @@ def _events_of(perception: Perception) -> tuple[str, ...]:
     return tuple(f"agent {one.agent_id} rejected: {one.reason}: {one.text}" for one in perception.rejected)
 
 
-def _map_lines(received: tuple[ReceivedMessage, ...]) -> dict[str, tuple[Floats, ...]]:
-    """Return the elements of received local maps in the world, by kind."""
-    lines: dict[str, list[Floats]] = {}
+def _place_local_maps(received: tuple[ReceivedMessage, ...]) -> dict[int, MapElements]:
+    """Return the received local maps in the world, by agent id."""
+    placed = dict[int, MapElements]()
     for one in received:
-        local_map = one.message.local_map
-        if local_map is None:
-            continue
-        pose = one.message.world_from_agent
-        x, y, _ = pose.translation.tolist()
-        elements = local_map.elements.transform(x, y, float(pose.yaw))
+        if one.message.local_map is not None:
+            pose = one.message.world_from_agent
+            x, y, _ = pose.translation.tolist()
+            placed[one.message.agent_id] = one.message.local_map.elements.transform(x, y, float(pose.yaw))
+    return placed
+
+
+def _lines_by_kind(many: Iterable[MapElements]) -> dict[str, tuple[Floats, ...]]:
+    """Return polylines (K, 2) by kind; rings are closed."""
+    lines: dict[str, list[Floats]] = {}
+    for elements in many:
+        closed = elements.closed
         for row in range(len(elements)):
-            lines.setdefault(KINDS[int(elements.kind[row])], []).append(elements.polyline(row))
+            line = elements.polyline(row)
+            line = np.concatenate((line, line[:1])) if closed[row] else line
+            lines.setdefault(KINDS[int(elements.kind[row])], []).append(line)
     return {kind: tuple(found) for kind, found in lines.items()}

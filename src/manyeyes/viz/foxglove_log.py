@@ -3,12 +3,9 @@
 
 | topic | schema | content |
 |---|---|---|
-| `/tf` | FrameTransform | stated pose of each agent, from `world` to `agent_ID` |
-| `/agents/ID/cloud` | PointCloud | x, y, z, intensity in `agent_ID` |
-| `/ego/boxes`, `/truth` | SceneUpdate | boxes in `world`, coloured as in ``viz.spatial_frame``, with scores as metadata |
-| `/links` | SceneUpdate | messages from agent to agent, grey when late |
-| `/corrections` | SceneUpdate | lines from stated to corrected positions |
-| `/map` | SceneUpdate | map elements |
+| `/tf` | FrameTransform | claimed pose of each agent, from `world` to `agent_ID` |
+| `/agents/ID/cloud` | PointCloud | x, y, z, intensity and colour in `agent_ID` |
+| `/GROUP` | SceneUpdate | boxes and lines in `world`, by group of ``viz.spatial_entities``; scores, bytes and ages as metadata |
 | `/plots` | plain JSON | numbers by path |
 | `/events` | Log | lines of text |
 
@@ -31,18 +28,26 @@ import numpy as np
 from manyeyes._io import atomic_replace
 from manyeyes.datatypes import Transform
 from manyeyes.datatypes.extras import import_extra
-from manyeyes.viz.spatial_frame import BOX_COLORS, Floats, ShownAgent, ShownBoxes, ShownLink, SpatialFrame
-
-MAX_POINTS = 30_000
-"""Points of a cloud that are written; of longer ones every n-th."""
-LATE_MS = 200.0
-_FLOAT32, _INFO, _LINE_STRIP = 7, 2, 0
-_LATE_COLOR, _LINK_COLOR, _CORRECTION_COLOR, _MAP_COLOR = (
-    (120, 120, 120),
-    (255, 255, 255),
-    (255, 90, 200),
-    (200, 200, 90),
+from manyeyes.viz.spatial_entities import (
+    Agents,
+    CloudColor,
+    Cubes,
+    Lines,
+    LoggedAgent,
+    LoggedCloud,
+    LoggedLines,
+    Numbers,
+    Rgb,
+    SpatialDescription,
 )
+from manyeyes.viz.spatial_frame import Floats, SpatialFrame
+
+_UINT8, _FLOAT32, _INFO, _LINE_STRIP = 1, 7, 2, 0
+_POINT = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")]
+    + [(c, "u1") for c in ("red", "green", "blue", "alpha")]
+)
+_NO_CLOUD = LoggedCloud(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), np.zeros((0, 3), np.uint8))
 Json = dict[str, Any]
 
 
@@ -97,9 +102,10 @@ class FoxgloveLog:
         MissingExtraError: mcap is not installed.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, cloud_color: CloudColor = "agent") -> None:
         writer = import_extra("mcap.writer", "live", "Writing a file for Foxglove")
         self._files, self._channels = ExitStack(), dict[str, int]()
+        self._description, self._clouds = SpatialDescription(cloud_color), set[str]()
         path.parent.mkdir(parents=True, exist_ok=True)
         draft = self._files.enter_context(atomic_replace(path))
         self._writer: Any = writer.Writer(self._files.enter_context(draft.open("wb")))
@@ -122,70 +128,66 @@ class FoxgloveLog:
     def add(self, frame: SpatialFrame) -> None:
         """Write one instant."""
         now_ns = frame.capture_ns
-        for agent in frame.agents:
-            self._add_agent(agent, now_ns)
-        self._add_scene("/ego/boxes", now_ns, _make_cubes(frame.boxes))
-        if frame.truth is not None:
-            self._add_scene("/truth", now_ns, _make_cubes(frame.truth))
-        positions = {agent.agent_id: agent.world_from_agent.translation.numpy() for agent in frame.agents}
-        links = [
-            _make_link(link, np.stack((positions[link.sender], positions[link.receiver])))
-            for link in frame.links
-            if link.sender in positions and link.receiver in positions
-        ]
-        self._add_scene("/links", now_ns, links)
-        moved = [
-            _entity(f"agent {agent.agent_id}", lines=[_make_correction(agent.world_from_agent, agent.corrected)])
-            for agent in frame.agents
-            if agent.corrected is not None
-        ]
-        self._add_scene("/corrections", now_ns, moved)
-        if frame.map_lines:
-            elements = [
-                _entity(kind, lines=[_line(_lift(line), _MAP_COLOR) for line in lines])
-                for kind, lines in frame.map_lines.items()
-            ]
-            self._add_scene("/map", now_ns, elements)
-        if frame.numbers:
-            self._write("/plots", "manyeyes.Plots", now_ns, _nest(frame.numbers))
-        for text in frame.events:
-            log = {"timestamp": _time(now_ns), "level": _INFO, "message": text, "name": "manyeyes"}
-            self._write("/events", "foxglove.Log", now_ns, log)
+        for entity in self._description.describe(frame):
+            match entity:
+                case Agents():
+                    self._add_agents(entity, now_ns)
+                case Cubes():
+                    self._add_scene(entity.group, now_ns, _make_cubes(entity))
+                case Lines():
+                    self._add_scene(entity.group, now_ns, [_make_lines(item) for item in entity.items])
+                case Numbers():
+                    self._write("/plots", "manyeyes.Plots", now_ns, _nest(entity.values))
+                case _:
+                    for text in entity.lines:
+                        log = {"timestamp": _time(now_ns), "level": _INFO, "message": text, "name": "manyeyes"}
+                        self._write("/events", "foxglove.Log", now_ns, log)
 
-    def _add_agent(self, agent: ShownAgent, now_ns: int) -> None:
-        name, pose = f"agent_{agent.agent_id}", agent.world_from_agent
+    def _add_agents(self, agents: Agents, now_ns: int) -> None:
+        for agent in agents.items:
+            self._add_pose(agent, now_ns)
+        clouds = {agent.name: agent.cloud for agent in agents.items if agent.cloud is not None}
+        for name, cloud in {**dict.fromkeys(sorted(self._clouds - clouds.keys()), _NO_CLOUD), **clouds}.items():
+            self._add_cloud(name, cloud, now_ns)
+        self._clouds = set(clouds)
+
+    def _add_pose(self, agent: LoggedAgent, now_ns: int) -> None:
         transform = {
             "timestamp": _time(now_ns),
             "parent_frame_id": "world",
-            "child_frame_id": name,
-            "translation": _vector(pose.translation.tolist()),
-            "rotation": _quaternion(pose),
+            "child_frame_id": f"agent_{agent.name}",
+            "translation": _vector(agent.world_from_agent.translation.tolist()),
+            "rotation": _quaternion(agent.world_from_agent),
         }
         self._write("/tf", "foxglove.FrameTransform", now_ns, transform)
-        if agent.points is None:
-            return
-        step = max(1, -(-len(agent.points) // MAX_POINTS))
-        intensity = np.ones(len(agent.points)) if agent.intensity is None else agent.intensity
-        rows = np.ascontiguousarray(np.column_stack((agent.points, intensity))[::step], "<f4")
-        names = ("x", "y", "z", "intensity")
-        cloud = {
+
+    def _add_cloud(self, name: str, cloud: LoggedCloud, now_ns: int) -> None:
+        rows = np.zeros(len(cloud.points), _POINT)
+        columns = (*cloud.points.T, cloud.intensity, *cloud.colors.T, 255)
+        for field, column in zip(_POINT.names or (), columns):
+            rows[field] = column
+        fields = [
+            {"name": field, "offset": int(offset), "type": _FLOAT32 if kind == np.float32 else _UINT8}
+            for field, (kind, offset, *_) in (_POINT.fields or {}).items()
+        ]
+        content = {
             "timestamp": _time(now_ns),
-            "frame_id": name,
+            "frame_id": f"agent_{name}",
             "pose": _pose((0.0, 0.0, 0.0)),
-            "point_stride": 16,
-            "fields": [{"name": field, "offset": 4 * k, "type": _FLOAT32} for k, field in enumerate(names)],
+            "point_stride": _POINT.itemsize,
+            "fields": fields,
             "data": base64.b64encode(rows.tobytes()).decode(),
         }
-        self._write(f"/agents/{agent.agent_id}/cloud", "foxglove.PointCloud", now_ns, cloud)
+        self._write(f"/agents/{name}/cloud", "foxglove.PointCloud", now_ns, content)
 
-    def _add_scene(self, topic: str, now_ns: int, entities: Sequence[Json]) -> None:
-        """Replace the entities of a topic."""
+    def _add_scene(self, group: str, now_ns: int, entities: Sequence[Json]) -> None:
+        """Replace the entities of a group."""
         stamp = _time(now_ns)
         update = {
             "deletions": [{"timestamp": stamp, "type": _DELETE_ALL, "id": ""}],
             "entities": [{"timestamp": stamp, "frame_id": "world", **entity} for entity in entities],
         }
-        self._write(topic, "foxglove.SceneUpdate", now_ns, update)
+        self._write(f"/{group}", "foxglove.SceneUpdate", now_ns, update)
 
     def _write(self, topic: str, schema: str, now_ns: int, content: Json) -> None:
         if topic not in self._channels:
@@ -235,7 +237,7 @@ def _pose(xyz: Sequence[float], yaw: float = 0.0) -> Json:
     return {"position": _vector(xyz), "orientation": _yaw_quaternion(yaw)}
 
 
-def _color(rgb: tuple[int, int, int], alpha: float = 1.0) -> Json:
+def _color(rgb: Rgb | Sequence[int], alpha: float = 1.0) -> Json:
     return {**dict(zip("rgb", (value / 255 for value in rgb))), "a": alpha}
 
 
@@ -247,7 +249,7 @@ def _entity(name: str, metadata: Mapping[str, str] | None = None, **primitives: 
     return {"id": name, "lifetime": _time(0), "frame_locked": False, "metadata": pairs, **every}
 
 
-def _line(points: Floats, color: tuple[int, int, int], thickness_m: float = 0.1) -> Json:
+def _line(points: Floats, color: Rgb, thickness_m: float) -> Json:
     """Return a line through points (N, 3)."""
     return {
         "type": _LINE_STRIP,
@@ -261,30 +263,19 @@ def _line(points: Floats, color: tuple[int, int, int], thickness_m: float = 0.1)
     }
 
 
-def _make_cubes(shown: ShownBoxes) -> list[Json]:
-    boxes = shown.boxes
-    columns = (boxes.center.tolist(), boxes.size.tolist(), boxes.yaw.tolist(), boxes.score.tolist(), boxes.id.tolist())
+def _make_cubes(cubes: Cubes) -> list[Json]:
+    boxes = cubes.boxes
+    columns = (boxes.center.tolist(), boxes.size.tolist(), boxes.yaw.tolist(), cubes.colors.tolist(), cubes.metadata)
     found = list[Json]()
-    for row, (center, size, yaw, score, number, kind) in enumerate(zip(*columns, shown.kinds)):
-        cube = {"pose": _pose(center, yaw), "size": _vector(size), "color": _color(BOX_COLORS[kind], 0.5)}
-        metadata = {"score": f"{score:.2f}", "kind": kind, **({"id": str(number)} if number >= 0 else {})}
+    for row, (center, size, yaw, color, metadata) in enumerate(zip(*columns)):
+        cube = {"pose": _pose(center, yaw), "size": _vector(size), "color": _color(color, 0.5)}
         found.append(_entity(str(row), metadata, cubes=[cube]))
     return found
 
 
-def _make_link(link: ShownLink, ends: Floats) -> Json:
-    color = _LATE_COLOR if link.age_ms > LATE_MS else _LINK_COLOR
-    metadata = {"bytes": str(link.num_bytes), "age_ms": f"{link.age_ms:.0f}"}
-    return _entity(f"{link.sender}-{link.receiver}", metadata, lines=[_line(ends, color)])
-
-
-def _make_correction(stated: Transform, corrected: Transform) -> Json:
-    ends = np.stack((stated.translation.double().numpy(), corrected.translation.double().numpy()))
-    return _line(ends, _CORRECTION_COLOR)
-
-
-def _lift(line: Floats) -> Floats:
-    return np.column_stack((line, np.zeros(len(line))))
+def _make_lines(item: LoggedLines) -> Json:
+    lines = [_line(line, item.color, item.width_m) for line in item.lines]
+    return _entity(item.name, item.metadata, lines=lines)
 
 
 def _nest(numbers: Mapping[str, float]) -> Json:

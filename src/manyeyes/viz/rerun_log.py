@@ -1,66 +1,83 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames for the viewer rerun (https://rerun.io): saved to a file, or streamed to a running viewer.
+"""Frames for the viewer rerun (https://rerun.io): saved to a file, or streamed to a running viewer or to a web viewer.
 
-| entity | content |
-|---|---|
-| `world/agents/ID` | stated pose; below it `cloud` |
-| `world/corrections/ID` | arrow from the stated to the corrected position |
-| `world/ego/boxes` | boxes with ids and scores, coloured by match with the truth, or by evidence |
-| `world/truth` | true boxes; missed ones in another colour |
-| `world/links/A-B` | messages, wider by bytes, grey when late |
-| `world/map/KIND` | map elements |
-| `plots/...` | numbers over time |
-| `events` | lines of text |
+The groups of ``viz.spatial_entities`` stand under `world/GROUP/NAME`, clouds under `world/agents/ID/cloud`, numbers under
+`plots/PATH`, text under `events`. What an instant no longer has is cleared.
 
-Timelines: `tick`, `capture` (time of the sweep) and, for links, `arrival`.
+Timelines: `tick`, `capture` (time of the sweep) and, for messages, `arrival`.
 """
 
 from __future__ import annotations
 
+import socket
+import time
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
 
-from manyeyes._io import atomic_rename
+from manyeyes._io import atomic_replace
 from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.extras import import_extra
-from manyeyes.viz.spatial_frame import BOX_COLORS, ShownAgent, ShownBoxes, ShownLink, SpatialFrame
+from manyeyes.viz.rerun_server import RerunServer, is_web_target
+from manyeyes.viz.spatial_entities import (
+    LINK_HEIGHT_M,
+    Agents,
+    CloudColor,
+    Cubes,
+    Lines,
+    LoggedAgent,
+    Numbers,
+    SpatialDescription,
+)
+from manyeyes.viz.spatial_frame import ShownAgent, SpatialFrame
 
 SUFFIX, URL_PREFIX = ".rrd", "rerun+http"
-MAX_POINTS = 30_000
-"""Points of a cloud that are shown; of longer ones every n-th."""
-LATE_MS = 200.0
-_AGENT_COLORS = ((90, 170, 255), (255, 170, 60), (120, 220, 120), (220, 120, 220), (240, 220, 90), (110, 220, 220))
-_LATE_COLOR, _LINK_COLOR, _CORRECTION_COLOR = (120, 120, 120), (255, 255, 255), (255, 90, 200)
-_BYTES_PER_CM = 1_000.0
+_CONNECT_S, _RETRY_S, _FLUSH_S, _POINT_PIXELS = 3.0, 0.2, 60.0, 1.2
+_EYE_M = (-35.0, 0.0, 30.0)
+"""Where the layout looks from, in the frame of the first agent."""
+_PLOTS = {"bytes": "Bytes of messages", "age_ms": "Age of messages, ms", "counts": "Boxes: matched, false, missed"}
+"""Plots of the layout: title by path; others can be added in the viewer."""
 
 
 class RerunLog:
-    """Logs frames to a file (.rrd) that appears when the log is closed, or to a viewer (rerun+http://HOST:PORT/proxy).
+    """Logs frames to a file, a viewer, or a web viewer.
+
+    target: FILE.rrd, which appears when the log is closed; rerun+http://HOST:PORT/proxy of a viewer that runs; web or web:PORT, the
+    web viewer, which is started on this machine and ends when the log is closed.
 
     Raises:
-        ConfigError: the target is neither.
+        ConfigError: the target is none of these, no viewer answers, or the port of the web viewer is taken.
         MissingExtraError: rerun is not installed.
     """
 
-    def __init__(self, target: str, name: str = "manyeyes") -> None:
+    def __init__(self, target: str, name: str = "manyeyes", cloud_color: CloudColor = "agent") -> None:
         is_file = target.endswith(SUFFIX)
-        if not is_file and not target.startswith(URL_PREFIX):
+        if not is_file and not is_web_target(target) and not target.startswith(URL_PREFIX):
             raise ConfigError(
-                f"A target of the viewer is a file {SUFFIX}, or {URL_PREFIX}://HOST:PORT/proxy; got {target!r}."
+                f"A target of the viewer is a file {SUFFIX}, web or web:PORT for the web viewer, or {URL_PREFIX}://HOST:PORT/proxy "
+                f"of a running viewer; got {target!r}."
             )
         self._rerun = import_extra("rerun", "rerun", "Logging for the viewer")
-        self._stream: Any = self._rerun.RecordingStream("manyeyes")
-        self._file = Path(target) if is_file else None
-        if self._file is not None:
-            self._file.parent.mkdir(parents=True, exist_ok=True)
-            self._draft = self._file.with_name(f"{self._file.stem}.partial{SUFFIX}")
-            self._stream.save(str(self._draft))
-        else:
-            self._stream.connect_grpc(target)
+        self._description, self._shown = SpatialDescription(cloud_color), dict[str, set[str]]()
+        self._has_layout, self._colored = False, set[str]()
+        self.server: RerunServer | None = None
+        with ExitStack() as resources:
+            self._stream: Any = self._rerun.RecordingStream("manyeyes")
+            if is_file:
+                draft = resources.enter_context(atomic_replace(Path(target), keep_suffix=True))
+                self._stream.save(str(draft))
+            else:
+                if is_web_target(target):
+                    self.server = resources.enter_context(RerunServer(target))
+                url = target if self.server is None else self.server.url
+                _check_answers(url)
+                self._stream.connect_grpc(url)
+            self._resources = resources.pop_all()
         self._stream.send_recording_name(name)
         self._stream.log("world", self._rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
@@ -70,85 +87,144 @@ class RerunLog:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._stream.flush()
-        self._stream.disconnect()
-        if self._file is not None:
-            if kind is None:
-                atomic_rename(self._draft, self._file)
-            else:
-                self._draft.unlink(missing_ok=True)
+        try:
+            self.flush()
+        finally:
+            self._stream.disconnect()
+            self._resources.__exit__(kind, error, trace)
+
+    def flush(self) -> None:
+        """Wait until all that was logged is written, or was received by the viewer.
+
+        Raises:
+            ConfigError: the viewer no longer answers.
+        """
+        try:
+            self._stream.flush(timeout_sec=_FLUSH_S)
+        except RuntimeError as error:
+            raise ConfigError(f"The viewer did not take all frames ({error}); start it again, and repeat.") from error
 
     def add(self, frame: SpatialFrame) -> None:
         """Log one instant."""
-        rerun, stream = self._rerun, self._stream
+        stream = self._stream
+        if not self._has_layout and frame.agents:
+            stream.send_blueprint(_make_layout(frame.agents[0]))
+            self._has_layout = True
         stream.reset_time()
         stream.set_time("tick", sequence=frame.index)
         stream.set_time("capture", timestamp=np.datetime64(frame.capture_ns, "ns"))
-        for number, agent in enumerate(frame.agents):
-            self._add_agent(agent, _AGENT_COLORS[number % len(_AGENT_COLORS)])
-        self._add_boxes("world/ego/boxes", frame.boxes)
-        if frame.truth is not None:
-            self._add_boxes("world/truth", frame.truth)
-        for kind, lines in frame.map_lines.items():
-            strips = [np.column_stack((line, np.zeros(len(line)))) for line in lines]
-            stream.log(f"world/map/{kind}", rerun.LineStrips3D(strips, radii=0.05))
-        for path, value in frame.numbers.items():
-            stream.log(f"plots/{path}", rerun.Scalars(float(value)))
-        for text in frame.events:
-            stream.log("events", rerun.TextLog(text))
-        positions = {agent.agent_id: agent.world_from_agent.translation.tolist() for agent in frame.agents}
-        for link in frame.links:
-            if link.sender in positions and link.receiver in positions:
-                self._add_link(link, positions[link.sender], positions[link.receiver])
+        for entity in self._description.describe(frame):
+            match entity:
+                case Agents():
+                    self._replace("agents", {agent.name for agent in entity.items})
+                    for agent in entity.items:
+                        self._add_agent(agent)
+                case Cubes():
+                    self._add_cubes(entity)
+                case Lines():
+                    self._add_lines(entity)
+                case Numbers():
+                    self._add_numbers(entity)
+                case _:
+                    for line in entity.lines:
+                        stream.log("events", self._rerun.TextLog(line))
 
-    def _add_agent(self, agent: ShownAgent, color: tuple[int, int, int]) -> None:
-        rerun, path, pose = self._rerun, f"world/agents/{agent.agent_id}", agent.world_from_agent
+    def _add_numbers(self, numbers: Numbers) -> None:
+        for path in numbers.colors.keys() - self._colored:
+            name = path.rpartition("/")[2]
+            style = self._rerun.SeriesLines(colors=[numbers.colors[path]], names=[name], widths=[2.0])
+            self._stream.log(f"plots/{path}", style, static=True)
+        self._colored |= numbers.colors.keys()
+        for path, value in numbers.values.items():
+            self._stream.log(f"plots/{path}", self._rerun.Scalars(float(value)))
+
+    def _replace(self, group: str, names: set[str]) -> None:
+        """Clear what a group had and no longer has: else a viewer shows it on."""
+        for name in sorted(self._shown.get(group, set()) - names):
+            self._stream.log(f"world/{group}/{name}", self._rerun.Clear(recursive=True))
+        self._shown[group] = names
+
+    def _add_agent(self, agent: LoggedAgent) -> None:
+        rerun, path, pose = self._rerun, f"world/agents/{agent.name}", agent.world_from_agent
         self._stream.log(path, rerun.Transform3D(translation=pose.translation.numpy(), mat3x3=pose.rotation.numpy()))
-        if agent.points is not None:
-            step = max(1, -(-len(agent.points) // MAX_POINTS))
-            colors = _shade(color, agent.intensity, len(agent.points))
-            self._stream.log(f"{path}/cloud", rerun.Points3D(agent.points[::step], colors=colors[::step], radii=0.03))
-        if agent.corrected is not None:
-            offset = (agent.corrected.translation - pose.translation).numpy()
-            arrow = rerun.Arrows3D(
-                origins=[pose.translation.numpy()], vectors=[offset], colors=[_CORRECTION_COLOR], radii=0.1
+        label = rerun.Points3D(
+            [[0.0, 0.0, LINK_HEIGHT_M]],
+            colors=[agent.color],
+            labels=[f"agent {agent.name}"],
+            radii=0.4,
+            show_labels=True,
+        )
+        self._stream.log(f"{path}/name", label)
+        if agent.cloud is not None:
+            points = rerun.Points3D(
+                agent.cloud.points, colors=agent.cloud.colors, radii=rerun.Radius.ui_points(_POINT_PIXELS)
             )
-            self._stream.log(f"world/corrections/{agent.agent_id}", arrow)
+            self._stream.log(f"{path}/cloud", points)
 
-    def _add_boxes(self, path: str, shown: ShownBoxes) -> None:
-        boxes = shown.boxes
-        half_yaw = boxes.yaw.double().numpy() / 2
-        quaternions = np.stack((0 * half_yaw, 0 * half_yaw, np.sin(half_yaw), np.cos(half_yaw)), 1)
-        labels = [
-            " ".join((*((f"{number}",) if number >= 0 else ()), f"{score:.2f}", kind))
-            for number, score, kind in zip(boxes.id.tolist(), boxes.score.tolist(), shown.kinds)
-        ]
-        self._stream.log(
-            path,
-            self._rerun.Boxes3D(
-                centers=boxes.center.numpy(),
-                half_sizes=boxes.size.numpy() / 2,
-                quaternions=quaternions,
-                colors=np.array([BOX_COLORS[kind] for kind in shown.kinds], np.uint8).reshape(-1, 3),
-                labels=labels,
-                show_labels=False,
-            ),
+    def _add_cubes(self, cubes: Cubes) -> None:
+        half_yaw = cubes.boxes.yaw.double().numpy() / 2
+        boxes = self._rerun.Boxes3D(
+            centers=cubes.boxes.center.numpy(),
+            half_sizes=cubes.boxes.size.numpy() / 2,
+            quaternions=np.stack((0 * half_yaw, 0 * half_yaw, np.sin(half_yaw), np.cos(half_yaw)), 1),
+            colors=cubes.colors,
+            labels=list(cubes.labels),
+            show_labels=False,
         )
+        self._stream.log(f"world/{cubes.group}", boxes)
 
-    def _add_link(self, link: ShownLink, sender: list[float], receiver: list[float]) -> None:
-        if link.arrival_ns is not None:
-            self._stream.set_time("arrival", timestamp=np.datetime64(link.arrival_ns, "ns"))
-        color = _LATE_COLOR if link.age_ms > LATE_MS else _LINK_COLOR
-        strip = self._rerun.LineStrips3D(
-            [[sender, receiver]],
-            radii=max(0.02, 0.01 * link.num_bytes / _BYTES_PER_CM),
-            colors=[color],
-            labels=[f"{link.num_bytes} B, {link.age_ms:.0f} ms"],
-        )
-        self._stream.log(f"world/links/{link.sender}-{link.receiver}", strip)
+    def _add_lines(self, lines: Lines) -> None:
+        rerun = self._rerun
+        self._replace(lines.group, {item.name for item in lines.items})
+        for item in lines.items:
+            path, style = f"world/{lines.group}/{item.name}", {"radii": item.width_m / 2, "colors": [item.color]}
+            labels = [item.label] * len(item.lines)
+            if lines.are_arrows:
+                origins, vectors = zip(*((line[0], line[-1] - line[0]) for line in item.lines))
+                drawn = rerun.Arrows3D(origins=origins, vectors=vectors, labels=labels, show_labels=False, **style)
+            else:
+                drawn = rerun.LineStrips3D(list(item.lines), labels=labels, show_labels=False, **style)
+            if item.arrival_ns is not None:
+                self._stream.set_time("arrival", timestamp=np.datetime64(item.arrival_ns, "ns"))
+            self._stream.log(path, drawn)
+            self._stream.disable_timeline("arrival")
 
 
-def _shade(color: tuple[int, int, int], intensity: NDArray[np.float32] | None, count: int) -> NDArray[np.uint8]:
-    """Return the colour of an agent, brighter by intensity: (N, 3)."""
-    light = np.full(count, 1.0) if intensity is None else 0.4 + 0.6 * np.clip(intensity, 0.0, 1.0)
-    return (np.array(color)[None] * light[:, None]).astype(np.uint8)
+def _check_answers(url: str) -> None:
+    """Wait for a moment until something listens at the address, as where both are started at once.
+
+    Raises:
+        ConfigError: nothing does: the viewer's own connection would wait without an error.
+    """
+    end = time.monotonic() + _CONNECT_S
+    while True:
+        try:
+            parts = urlsplit(url)
+            with socket.create_connection((parts.hostname or "", parts.port or 0), timeout=_CONNECT_S):
+                return
+        except (OSError, ValueError) as error:
+            if not isinstance(error, ConnectionError) or time.monotonic() > end:
+                remedy = f"start one with 'rerun', or save a file {SUFFIX}"
+                raise ConfigError(f"{url}: no viewer answers ({error}); {remedy}.") from error
+        time.sleep(_RETRY_S)
+
+
+def _make_layout(ego: ShownAgent) -> Any:
+    """Return the arrangement of views: the scene about the ego, beside it plots and events; the time line is that of sweeps."""
+    views = import_extra("rerun.blueprint", "rerun", "Logging for the viewer")
+    eye = ego.world_from_agent.apply(torch.tensor([_EYE_M], dtype=torch.float64))[0]
+    controls = views.EyeControls3D(
+        position=eye.tolist(),
+        look_target=ego.world_from_agent.translation.tolist(),
+        eye_up=(0.0, 0.0, 1.0),
+        tracking_entity=f"world/agents/{ego.agent_id}",
+    )
+    scene = views.Spatial3DView(origin="world", name="Scene", background=(20, 22, 26), eye_controls=controls)
+    plots = [views.TimeSeriesView(origin=f"plots/{path}", name=name) for path, name in _PLOTS.items()]
+    side = views.Vertical(*plots, views.TextLogView(origin="events", name="Events"))
+    return views.Blueprint(
+        views.Horizontal(scene, side, column_shares=[3, 1]),
+        views.TimePanel(timeline="tick", state="collapsed"),
+        views.SelectionPanel(state="collapsed"),
+        views.BlueprintPanel(state="collapsed"),
+    )

@@ -35,7 +35,8 @@ BOX_COLORS = {
 class ShownAgent:
     """An agent. points: (N, 3) in its frame, intensity: (N,) from 0 to 1; both None where its cloud is not known.
 
-    corrected: the pose after correction, None where it was not corrected.
+    world_from_agent: the claimed pose. corrected: the pose after correction, None where it was not corrected. true_pose: None where
+    it is not known, or is the claimed one.
     """
 
     agent_id: int
@@ -43,6 +44,7 @@ class ShownAgent:
     points: NDArray[np.float32] | None = None
     intensity: NDArray[np.float32] | None = None
     corrected: Transform | None = None
+    true_pose: Transform | None = None
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,8 @@ class ShownLink:
 
 @dataclass(frozen=True)
 class SpatialFrame:
-    """One instant. capture_ns: of the ego's sweep. map_lines: (K, 2) polylines by kind of element.
+    """One instant. capture_ns: of the ego's sweep. map_lines: (K, 2) polylines by kind of element; the same object where they did
+    not change.
 
     numbers: by path of the plot, such as age_ms/3. events: lines of text.
     """

@@ -34,16 +34,18 @@ def main(options: Options) -> None:
 
     from manyeyes.cli.live.options import make_agent
     from manyeyes.datatypes import ConfigError
+    from manyeyes.runtime.recorder import count_ticks
     from manyeyes.runtime.replay import read_config
-    from manyeyes.studies.spatial_views import show_run
+    from manyeyes.studies.spatial_views import log_frames, show_run
     from manyeyes.viz.foxglove_log import FoxgloveLog
+    from manyeyes.viz.progress import make_progress_bars
 
     if options.foxglove.resolve() == options.run.resolve():
         raise ConfigError(f"--foxglove {options.foxglove} is the recording itself; choose another file.")
     torch.set_num_threads(read_config(options.run).num_threads)
-    num = 0
-    with FoxgloveLog(options.foxglove) as log:
-        for frame in show_run(options.run, make_agent, options.min_score):
-            log.add(frame)
-            num += 1
-    Console().print(f"{options.foxglove}: {num} frames; open it with Foxglove", highlight=False, soft_wrap=True)
+    console = Console()
+    frames = show_run(options.run, make_agent, options.min_score)
+    with FoxgloveLog(options.foxglove) as log, make_progress_bars(console) as progress:
+        task = progress.add_task("Logging", total=count_ticks(options.run))
+        num = log_frames(frames, (log,), lambda: progress.advance(task))
+    console.print(f"{options.foxglove}: {num} frames; open it with Foxglove", highlight=False, soft_wrap=True)
