@@ -100,6 +100,8 @@ def test_boxes_have_place_heading_colour_and_score(tmp_path) -> None:
     assert cube["size"] == pytest.approx({"x": 4.0, "y": 2.0, "z": 1.6}) and first["frame_id"] == "world"
     red, green, blue = (value / 255 for value in BOX_COLORS["matched"])
     assert cube["color"] == pytest.approx({"r": red, "g": green, "b": blue, "a": 0.5})
+    (text,) = second["texts"]
+    assert text["text"] == "0.40 false" and text["pose"]["position"] == pytest.approx({"x": 30.0, "y": 0.0, "z": 1.6})
     assert {"key": "score", "value": "0.40"} in second["metadata"] and update["deletions"][0]["type"] == 1
 
 
@@ -157,6 +159,9 @@ def test_messages_of_unknown_senders_and_numbers_without_value_are_left_out(tmp_
     (link,) = found["/links"][0][2]["entities"]
     assert link["id"] == "2-1" and [p["x"] for p in link["lines"][0]["points"]] == [11.0, 1.0]
     assert link["lines"][0]["color"]["r"] == pytest.approx(120 / 255)
+    (label,) = link["texts"]
+    assert label["text"] == "1500 B, 280 ms" and label["pose"]["position"]["x"] == 6.0
+    assert all(entity["texts"] == [] for entity in found["/truth"][0][2]["entities"])
     assert found["/plots"][0][2] == {"age_ms": {"2": 80.0}, "level": 0.0}
 
 

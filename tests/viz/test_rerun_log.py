@@ -146,6 +146,7 @@ def test_links_lie_above_the_road_and_are_wider_by_bytes(tmp_path: Path) -> None
             log.add(replace(make_frame(index), links=(ShownLink(2, 1, num_bytes, 80.0),)))
     links = read_back(tmp_path / "a.rrd")["/world/links/2-1"]
     assert [radii[0] for radii in column(links, "LineStrips3D:radii")] == pytest.approx([0.02, 0.1, 0.3])
+    assert column(links, "LineStrips3D:show_labels") == [[True]] * 3
     assert column(links, "LineStrips3D:strips")[0] == [[[11.0, 2.0, LINK_HEIGHT_M], [1.0, 2.0, LINK_HEIGHT_M]]]
 
 

@@ -35,7 +35,7 @@ class SpatialLog(Protocol):
     """Where frames are logged: ``viz.rerun_log.RerunLog``, ``viz.foxglove_log.FoxgloveLog``."""
 
     def add(self, frame: SpatialFrame) -> None:
-        """Log one instant."""
+        """Log the frame of one instant."""
         ...
 
 

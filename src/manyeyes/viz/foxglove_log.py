@@ -29,20 +29,22 @@ from manyeyes._io import atomic_replace
 from manyeyes.datatypes import Transform
 from manyeyes.datatypes.extras import import_extra
 from manyeyes.viz.spatial_entities import (
-    Agents,
+    AgentGroup,
+    BoxGroup,
     CloudColor,
-    Cubes,
-    Lines,
+    LineGroup,
     LoggedAgent,
     LoggedCloud,
     LoggedLines,
-    Numbers,
+    NumberGroup,
     Rgb,
     SpatialDescription,
 )
 from manyeyes.viz.spatial_frame import Floats, SpatialFrame
 
 _UINT8, _FLOAT32, _INFO, _LINE_STRIP = 1, 7, 2, 0
+_LABEL_M = 0.8
+"""Height of the letters of labels."""
 _POINT = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")]
     + [(c, "u1") for c in ("red", "green", "blue", "alpha")]
@@ -59,7 +61,7 @@ def _array(items: Json) -> Json:
     return {"type": "array", "items": items}
 
 
-_NUMBER, _INTEGER, _TEXT = {"type": "number"}, {"type": "integer"}, {"type": "string"}
+_NUMBER, _INTEGER, _TEXT, _BOOL = ({"type": name} for name in ("number", "integer", "string", "boolean"))
 _TIME = _object(sec=_INTEGER, nsec=_INTEGER)
 _VECTOR = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
 _QUATERNION = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
@@ -73,6 +75,9 @@ _ENTITY = _object(
     metadata=_array(_object(key=_TEXT, value=_TEXT)),
     cubes=_array(_object(pose=_POSE, size=_VECTOR, color=_COLOR)),
     lines=_array(_LINE),
+    texts=_array(
+        _object(pose=_POSE, billboard=_BOOL, font_size=_NUMBER, scale_invariant=_BOOL, color=_COLOR, text=_TEXT)
+    ),
 )
 _DELETION = _object(timestamp=_TIME, type=_INTEGER, id=_TEXT)
 _FIELD = _object(name=_TEXT, offset=_INTEGER, type=_INTEGER)
@@ -126,24 +131,26 @@ class FoxgloveLog:
         self._files.__exit__(kind, error, trace)
 
     def add(self, frame: SpatialFrame) -> None:
-        """Write one instant."""
+        """Write the frame of one instant."""
         now_ns = frame.capture_ns
         for entity in self._description.describe(frame):
             match entity:
-                case Agents():
+                case AgentGroup():
                     self._add_agents(entity, now_ns)
-                case Cubes():
+                case BoxGroup():
                     self._add_scene(entity.group, now_ns, _make_cubes(entity))
-                case Lines():
-                    self._add_scene(entity.group, now_ns, [_make_lines(item) for item in entity.items])
-                case Numbers():
+                case LineGroup():
+                    self._add_scene(
+                        entity.group, now_ns, [_make_lines(item, entity.shows_labels) for item in entity.items]
+                    )
+                case NumberGroup():
                     self._write("/plots", "manyeyes.Plots", now_ns, _nest(entity.values))
                 case _:
                     for text in entity.lines:
                         log = {"timestamp": _time(now_ns), "level": _INFO, "message": text, "name": "manyeyes"}
                         self._write("/events", "foxglove.Log", now_ns, log)
 
-    def _add_agents(self, agents: Agents, now_ns: int) -> None:
+    def _add_agents(self, agents: AgentGroup, now_ns: int) -> None:
         for agent in agents.items:
             self._add_pose(agent, now_ns)
         clouds = {agent.name: agent.cloud for agent in agents.items if agent.cloud is not None}
@@ -263,19 +270,36 @@ def _line(points: Floats, color: Rgb, thickness_m: float) -> Json:
     }
 
 
-def _make_cubes(cubes: Cubes) -> list[Json]:
+def _text(text: str, xyz: Sequence[float], color: Rgb | Sequence[int]) -> Json:
+    """Return a text that faces the viewer, at a place in the world."""
+    return {
+        "pose": _pose(xyz),
+        "billboard": True,
+        "font_size": _LABEL_M,
+        "scale_invariant": False,
+        "color": _color(color),
+        "text": text,
+    }
+
+
+def _make_cubes(cubes: BoxGroup) -> list[Json]:
     boxes = cubes.boxes
-    columns = (boxes.center.tolist(), boxes.size.tolist(), boxes.yaw.tolist(), cubes.colors.tolist(), cubes.metadata)
+    places = zip(boxes.center.tolist(), boxes.size.tolist(), boxes.yaw.tolist())
     found = list[Json]()
-    for row, (center, size, yaw, color, metadata) in enumerate(zip(*columns)):
+    for row, (center, size, yaw) in enumerate(places):
+        color, metadata = cubes.colors[row].tolist(), cubes.metadata[row]
         cube = {"pose": _pose(center, yaw), "size": _vector(size), "color": _color(color, 0.5)}
-        found.append(_entity(str(row), metadata, cubes=[cube]))
+        above = (center[0], center[1], center[2] + size[2] / 2)
+        texts = [_text(cubes.labels[row], above, color)] if cubes.shows_labels else []
+        found.append(_entity(str(row), metadata, cubes=[cube], texts=texts))
     return found
 
 
-def _make_lines(item: LoggedLines) -> Json:
+def _make_lines(item: LoggedLines, shows_label: bool) -> Json:
     lines = [_line(line, item.color, item.width_m) for line in item.lines]
-    return _entity(item.name, item.metadata, lines=lines)
+    middles = [line.mean(0).tolist() for line in item.lines] if shows_label else []
+    texts = [_text(item.label, middle, item.color) for middle in middles]
+    return _entity(item.name, item.metadata, lines=lines, texts=texts)
 
 
 def _nest(numbers: Mapping[str, float]) -> Json:

@@ -26,12 +26,12 @@ from manyeyes.datatypes.extras import import_extra
 from manyeyes.viz.rerun_server import RerunServer, is_web_target
 from manyeyes.viz.spatial_entities import (
     LINK_HEIGHT_M,
-    Agents,
+    AgentGroup,
+    BoxGroup,
     CloudColor,
-    Cubes,
-    Lines,
+    LineGroup,
     LoggedAgent,
-    Numbers,
+    NumberGroup,
     SpatialDescription,
 )
 from manyeyes.viz.spatial_frame import ShownAgent, SpatialFrame
@@ -39,7 +39,7 @@ from manyeyes.viz.spatial_frame import ShownAgent, SpatialFrame
 SUFFIX, URL_PREFIX = ".rrd", "rerun+http"
 _CONNECT_S, _RETRY_S, _FLUSH_S, _POINT_PIXELS = 3.0, 0.2, 60.0, 1.2
 _EYE_M = (-35.0, 0.0, 30.0)
-"""Where the layout looks from, in the frame of the first agent."""
+"""Position of the camera of the layout, in the frame of the first agent."""
 _PLOTS = {"bytes": "Bytes of messages", "age_ms": "Age of messages, ms", "counts": "Boxes: matched, false, missed"}
 """Plots of the layout: title by path; others can be added in the viewer."""
 
@@ -105,7 +105,7 @@ class RerunLog:
             raise ConfigError(f"The viewer did not take all frames ({error}); start it again, and repeat.") from error
 
     def add(self, frame: SpatialFrame) -> None:
-        """Log one instant."""
+        """Log the frame of one instant."""
         stream = self._stream
         if not self._has_layout and frame.agents:
             stream.send_blueprint(_make_layout(frame.agents[0]))
@@ -115,21 +115,21 @@ class RerunLog:
         stream.set_time("capture", timestamp=np.datetime64(frame.capture_ns, "ns"))
         for entity in self._description.describe(frame):
             match entity:
-                case Agents():
+                case AgentGroup():
                     self._replace("agents", {agent.name for agent in entity.items})
                     for agent in entity.items:
                         self._add_agent(agent)
-                case Cubes():
+                case BoxGroup():
                     self._add_cubes(entity)
-                case Lines():
+                case LineGroup():
                     self._add_lines(entity)
-                case Numbers():
+                case NumberGroup():
                     self._add_numbers(entity)
                 case _:
                     for line in entity.lines:
                         stream.log("events", self._rerun.TextLog(line))
 
-    def _add_numbers(self, numbers: Numbers) -> None:
+    def _add_numbers(self, numbers: NumberGroup) -> None:
         for path in numbers.colors.keys() - self._colored:
             name = path.rpartition("/")[2]
             style = self._rerun.SeriesLines(colors=[numbers.colors[path]], names=[name], widths=[2.0])
@@ -161,7 +161,7 @@ class RerunLog:
             )
             self._stream.log(f"{path}/cloud", points)
 
-    def _add_cubes(self, cubes: Cubes) -> None:
+    def _add_cubes(self, cubes: BoxGroup) -> None:
         half_yaw = cubes.boxes.yaw.double().numpy() / 2
         boxes = self._rerun.Boxes3D(
             centers=cubes.boxes.center.numpy(),
@@ -169,21 +169,21 @@ class RerunLog:
             quaternions=np.stack((0 * half_yaw, 0 * half_yaw, np.sin(half_yaw), np.cos(half_yaw)), 1),
             colors=cubes.colors,
             labels=list(cubes.labels),
-            show_labels=False,
+            show_labels=cubes.shows_labels,
         )
         self._stream.log(f"world/{cubes.group}", boxes)
 
-    def _add_lines(self, lines: Lines) -> None:
+    def _add_lines(self, lines: LineGroup) -> None:
         rerun = self._rerun
         self._replace(lines.group, {item.name for item in lines.items})
         for item in lines.items:
             path, style = f"world/{lines.group}/{item.name}", {"radii": item.width_m / 2, "colors": [item.color]}
-            labels = [item.label] * len(item.lines)
+            labels, shown = [item.label] * len(item.lines), {"show_labels": lines.shows_labels}
             if lines.are_arrows:
                 origins, vectors = zip(*((line[0], line[-1] - line[0]) for line in item.lines))
-                drawn = rerun.Arrows3D(origins=origins, vectors=vectors, labels=labels, show_labels=False, **style)
+                drawn = rerun.Arrows3D(origins=origins, vectors=vectors, labels=labels, **shown, **style)
             else:
-                drawn = rerun.LineStrips3D(list(item.lines), labels=labels, show_labels=False, **style)
+                drawn = rerun.LineStrips3D(list(item.lines), labels=labels, **shown, **style)
             if item.arrival_ns is not None:
                 self._stream.set_time("arrival", timestamp=np.datetime64(item.arrival_ns, "ns"))
             self._stream.log(path, drawn)

@@ -66,7 +66,7 @@ class RerunServer:
         self._process.wait()
 
     def close(self) -> None:
-        """End the process."""
+        """End the process of the viewer."""
         self._process.terminate()
         try:
             self._process.wait(_STOP_S)

@@ -5,15 +5,15 @@ Colours, labels, widths and the thinning of clouds are decided here, once for bo
 
 | group | entity | content |
 |---|---|---|
-| `agents` | `Agents` | claimed pose of each agent, its cloud in its frame |
-| `corrections` | `Lines` | from claimed to corrected positions |
-| `pose_errors` | `Lines` | from claimed to true positions |
-| `ego/boxes` | `Cubes` | boxes, coloured by match with the truth, or by evidence |
-| `truth` | `Cubes` | true boxes; missed ones in another colour |
-| `links` | `Lines` | messages, wider by bytes, grey when late |
-| `map` | `Lines` | map elements, an item a kind; again only where they changed |
-| `plots` | `Numbers` | numbers by path |
-| `events` | `Texts` | lines of text |
+| `agents` | `AgentGroup` | claimed pose of each agent, its cloud in its frame |
+| `corrections` | `LineGroup` | from claimed to corrected positions |
+| `pose_errors` | `LineGroup` | from claimed to true positions |
+| `ego/boxes` | `BoxGroup` | boxes, coloured by match with the truth, or by evidence |
+| `truth` | `BoxGroup` | true boxes; missed ones in another colour |
+| `links` | `LineGroup` | messages, wider by bytes, grey when late |
+| `map` | `LineGroup` | map elements, an item a kind; again only where they changed |
+| `plots` | `NumberGroup` | numbers by path |
+| `events` | `TextGroup` | lines of text |
 """
 
 from __future__ import annotations
@@ -51,6 +51,8 @@ MAP_COLORS: Mapping[str, Rgb] = {
     "stop_line": (240, 100, 100),
 }
 """Colours of map elements by kind."""
+_GROUPS_WITHOUT_LABELS = frozenset({"truth", "map"})
+"""Groups whose labels a viewer shows for a chosen item alone: their colours say what they are."""
 _OTHER_MAP_COLOR: Rgb = (200, 200, 90)
 _LATE_COLOR, _LINK_COLOR, _CORRECTION_COLOR, _POSE_ERROR_COLOR = (
     (120, 120, 120),
@@ -83,14 +85,14 @@ class LoggedAgent:
 
 
 @dataclass(frozen=True)
-class Agents:
+class AgentGroup:
     """All agents of an instant."""
 
     items: tuple[LoggedAgent, ...]
 
 
 @dataclass(frozen=True)
-class Cubes:
+class BoxGroup:
     """Boxes in the world: colors (N, 3) uint8, a label each, and pairs of text that a viewer shows for a chosen one."""
 
     group: str
@@ -98,6 +100,11 @@ class Cubes:
     colors: NDArray[np.uint8]
     labels: tuple[str, ...]
     metadata: tuple[Mapping[str, str], ...]
+
+    @property
+    def shows_labels(self) -> bool:
+        """Whether labels stand in the scene, and not only with a chosen box: those of detections."""
+        return self.group not in _GROUPS_WITHOUT_LABELS
 
 
 @dataclass(frozen=True)
@@ -114,7 +121,7 @@ class LoggedLines:
 
 
 @dataclass(frozen=True)
-class Lines:
+class LineGroup:
     """All lines of a group; they take the place of those that it had. are_arrows: each line is an arrow from its first point to its
     last.
     """
@@ -123,9 +130,14 @@ class Lines:
     items: tuple[LoggedLines, ...]
     are_arrows: bool = False
 
+    @property
+    def shows_labels(self) -> bool:
+        """Whether labels stand in the scene."""
+        return self.group not in _GROUPS_WITHOUT_LABELS
+
 
 @dataclass(frozen=True)
-class Numbers:
+class NumberGroup:
     """Numbers by path of the plot, such as age_ms/3. colors: of those paths that stand for an agent, or for a kind of boxes."""
 
     values: Mapping[str, float]
@@ -133,13 +145,13 @@ class Numbers:
 
 
 @dataclass(frozen=True)
-class Texts:
-    """Lines of text."""
+class TextGroup:
+    """Lines of text of an instant."""
 
     lines: tuple[str, ...]
 
 
-Entity = Agents | Cubes | Lines | Numbers | Texts
+Entity = AgentGroup | BoxGroup | LineGroup | NumberGroup | TextGroup
 
 
 class SpatialDescription:
@@ -152,7 +164,7 @@ class SpatialDescription:
 
     def describe(self, frame: SpatialFrame) -> Iterator[Entity]:
         """Yield the entities of one instant. Each replaces its group: lines that are gone are yielded as a group without items."""
-        yield Agents(tuple(self._make_agent(number, agent) for number, agent in enumerate(frame.agents)))
+        yield AgentGroup(tuple(self._make_agent(number, agent) for number, agent in enumerate(frame.agents)))
         corrected = [(agent, agent.corrected) for agent in frame.agents if agent.corrected is not None]
         true_poses = [(agent, agent.true_pose) for agent in frame.agents if agent.true_pose is not None]
         yield from self._make_lines("corrections", [_make_arrow(*pair, _CORRECTION_COLOR) for pair in corrected], True)
@@ -167,15 +179,15 @@ class SpatialDescription:
             yield from self._make_lines("map", kinds)
         self._map = frame.map_lines
         if frame.numbers:
-            yield Numbers(frame.numbers, _color_numbers(frame))
+            yield NumberGroup(frame.numbers, _color_numbers(frame))
         if frame.events:
-            yield Texts(frame.events)
+            yield TextGroup(frame.events)
 
-    def _make_lines(self, group: str, items: Sequence[LoggedLines], are_arrows: bool = False) -> Iterator[Lines]:
+    def _make_lines(self, group: str, items: Sequence[LoggedLines], are_arrows: bool = False) -> Iterator[LineGroup]:
         """Yield a group that has items, or had some."""
         if items or group in self._filled:
             self._filled.add(group)
-            yield Lines(group, tuple(items), are_arrows)
+            yield LineGroup(group, tuple(items), are_arrows)
 
     def _make_agent(self, number: int, agent: ShownAgent) -> LoggedAgent:
         color = _agent_color(number)
@@ -230,11 +242,11 @@ def measure_pose_difference(one: Transform, other: Transform) -> tuple[float, fl
     return float(offset.norm()), abs(np.degrees((turn + np.pi) % (2 * np.pi) - np.pi))
 
 
-def _make_cubes(group: str, shown: ShownBoxes) -> Cubes:
+def _make_cubes(group: str, shown: ShownBoxes) -> BoxGroup:
     boxes = shown.boxes
     rows = list(zip(boxes.id.tolist(), boxes.score.tolist(), shown.kinds))
     numbers = [str(number) if number >= 0 else "" for number, _, _ in rows]
-    return Cubes(
+    return BoxGroup(
         group,
         boxes,
         np.array([BOX_COLORS[kind] for kind in shown.kinds], np.uint8).reshape(-1, 3),
