@@ -124,8 +124,9 @@ def test_doctor_looks_for_what_the_extras_install(capsys: pytest.CaptureFixture[
 @pytest.mark.slow
 def test_the_package_imports_no_extra_before_it_is_needed() -> None:
     code = (
-        "import sys, manyeyes.cli.main, manyeyes.agents.agent; "
-        "optional = 'shapely pyarrow PIL matplotlib libsumo cryptography zenoh mcap'.split(); "
+        "import sys, manyeyes.cli.main, manyeyes.agents.agent, manyeyes.cli.view, manyeyes.studies.spatial_views; "
+        "import manyeyes.viz.rerun_log, manyeyes.viz.foxglove_log; "
+        "optional = 'shapely pyarrow PIL matplotlib libsumo cryptography zenoh mcap rerun rerun_cli'.split(); "
         "sys.exit(any(m in sys.modules for m in optional))"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
