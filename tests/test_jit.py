@@ -1,21 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two processes that compile two variants of one function at once keep both, each under its own name."""
+"""Compiled loops: two processes that compile variants of one at once keep both; what a loop calls is linked into it."""
 
 from __future__ import annotations
 
 import multiprocessing
 import pickle
 import re
+import subprocess
+import sys
 import time
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from typing import Any
 
 import numba
+import numpy as np
 import pytest
 
 import manyeyes
-from manyeyes._jit import _LockedIndexFile, njit
+from manyeyes._jit import _LockedIndexFile, njit, set_row
 
 
 class _Slow(_LockedIndexFile):
@@ -74,6 +77,76 @@ def test_loops_are_kept_so() -> None:
         return n
 
     assert isinstance(loop._cache._cache_file, _LockedIndexFile)
+
+
+def test_a_loop_called_by_loops_has_no_code_of_its_own_until_python_calls_it() -> None:
+    @njit()
+    def square(x):  # pragma: no cover
+        if x < 0:
+            raise ValueError("below zero")
+        return x * x
+
+    @njit()
+    def sum_squares(values):  # pragma: no cover
+        total = 0.0
+        for i in range(len(values)):
+            total += square(values[i])
+        return total
+
+    assert sum_squares(np.array([1.0, 2.0, 3.0])) == 14.0
+    assert not square.overloads and len(sum_squares.overloads) == 1
+    with pytest.raises(ValueError, match="below zero"):
+        sum_squares(np.array([-1.0]))
+    assert square(4.0) == 16.0 and len(square.overloads) == 1
+    assert sum_squares(np.array([5.0])) == 25.0
+    assert sum_squares(np.array([5.0], np.float32)) == 25.0
+
+
+def test_loops_call_themselves_and_one_another() -> None:
+    @njit()
+    def factorial(n):  # pragma: no cover
+        return 1 if n < 2 else n * factorial(n - 1)
+
+    @njit()
+    def binomial(n, k):  # pragma: no cover
+        return factorial(n) // (factorial(k) * factorial(n - k))
+
+    assert factorial(5) == 120
+    assert binomial(5, 2) == 10
+
+
+_TWO_LOOPS = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from two_loops import outer
+print(outer(3.0), sum(outer.stats.cache_hits.values()), sum(outer.stats.cache_misses.values()))
+"""
+_MODULE = """
+from manyeyes._jit import njit
+
+@njit(cache=True)
+def inner(x):
+    return x + 1.0
+
+@njit(cache=True)
+def outer(x):
+    return 2.0 * inner(x)
+"""
+
+
+@pytest.mark.slow
+def test_a_later_process_takes_the_whole_loop_from_the_disk(tmp_path: Path) -> None:
+    (tmp_path / "two_loops.py").write_text(_MODULE)
+    command = [sys.executable, "-c", _TWO_LOOPS, str(tmp_path)]
+    outputs = [subprocess.run(command, capture_output=True, text=True, check=True).stdout.split() for _ in range(2)]
+    assert outputs == [["8.0", "0", "1"], ["8.0", "1", "0"]]
+    assert not [path.name for path in tmp_path.rglob("*.nbc") if "inner" in path.name]
+
+
+def test_a_row_is_set() -> None:
+    out = np.zeros((2, 3), np.float32)
+    set_row(out[1], np.array([1.0, 2.0, 3.0], np.float32))
+    assert out.tolist() == [[0, 0, 0], [1, 2, 3]]
 
 
 def test_every_loop_takes_njit_from_here() -> None:

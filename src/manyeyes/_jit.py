@@ -3,18 +3,27 @@
 
 numba numbers the cache files of a function's variants: two processes that compile two variants at the same time use one file name
 for both, and later processes load the wrong variant without an error. Workers that start together on a fresh installation are such
-processes. Every compiled loop of the package takes njit from here.
+processes.
+
+numba makes machine code of every loop that another one calls, and optimises it again in each caller. Here a loop that a compiled
+one calls is only linked into it, and optimised there, so that a fresh installation compiles in about half the time. A loop that
+Python calls is compiled and kept as numba does it. Every compiled loop of the package takes njit from here.
 """
 
 from __future__ import annotations
 
 import pickle
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Literal
 
 import numpy as np
 from filelock import FileLock
-from numba import njit
 from numba.core import caching
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, CompilerBase, DefaultPassBuilder
+from numba.core.compiler_machinery import register_pass
+from numba.core.registry import CPUDispatcher
+from numba.core.typed_passes import NativeLowering
 
 __all__ = [
     "Boolx1",
@@ -37,6 +46,7 @@ __all__ = [
     "U8x2",
     "Uintpx1",
     "njit",
+    "set_row",
 ]
 
 
@@ -64,6 +74,81 @@ class _LockedIndexFile(caching.IndexDataCacheFile):
 
 caching.IndexDataCacheFile = _LockedIndexFile
 
+
+class _LinkedLibrary(JITCodeLibrary):
+    """The intermediate code of a loop, for the libraries of its callers: neither optimised nor made machine code by itself."""
+
+    def _optimize_final_module(self) -> None:
+        pass
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _LinkedLowering(NativeLowering):
+    """numba's last pass, ending with a _LinkedLibrary."""
+
+    _name = "linked_lowering"
+
+    def run_pass(self, state: Any) -> Literal[True]:
+        state.library = _LinkedLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.flags.no_compile = True
+        super().run_pass(state)
+        # Callers find the loop by its entry point, of which numba wants a builtin; this one is never called.
+        entry_point = object().__reduce__
+        state.targetctx.insert_user_function(entry_point, state["cr"].fndesc, [state.library])
+        state["cr"] = state["cr"]._replace(cfunc=entry_point)
+        return True
+
+
+class _LinkedCompiler(CompilerBase):
+    """numba's compiler, ending with a _LinkedLibrary."""
+
+    def define_pipelines(self) -> list[Any]:
+        manager = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        manager.passes = [(_LinkedLowering if step is NativeLowering else step, why) for step, why in manager.passes]
+        manager.finalize()
+        return [manager]
+
+
+class _Loop(CPUDispatcher):
+    """A loop to be called from Python, and its form for callers that are compiled."""
+
+    def __init__(
+        self, py_func: Any, locals: Any = None, targetoptions: Any = None, pipeline_class: type[CompilerBase] = Compiler
+    ) -> None:
+        super().__init__(py_func, locals, targetoptions, pipeline_class)
+        without_wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+        self._linked = CPUDispatcher(py_func, locals, {**(targetoptions or {}), **without_wrappers}, _LinkedCompiler)
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        return self._linked.get_call_template(args, kws)
+
+    def get_overload(self, sig: Any) -> Any:
+        return self._linked.get_overload(sig)
+
+    @property
+    def is_compiling(self) -> Any:
+        return super().is_compiling or self._linked.is_compiling
+
+
+def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return numba's decorator of the same name, for functions without signatures; options: its other options.
+
+    A loop is compiled at its first call, for the types of the arguments; cache: keep it on disk.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        loop = _Loop(function, targetoptions={"nopython": True, "boundscheck": None, **options})
+        if cache:
+            loop.enable_caching()
+        return loop
+
+    return decorate
+
+
 Int64 = int | np.int64
 """Integer of a compiled loop."""
 
@@ -87,3 +172,13 @@ I64x3 = np.ndarray[tuple[int, int, int], np.dtype[np.int64]]
 U8x1 = np.ndarray[tuple[int], np.dtype[np.uint8]]
 U8x2 = np.ndarray[tuple[int, int], np.dtype[np.uint8]]
 Uintpx1 = np.ndarray[tuple[int], np.dtype[np.uintp]]
+
+
+@njit(cache=True, nogil=True)
+def set_row(out: Any, values: Any) -> None:  # pragma: no cover
+    """out (N,) = the first N of values (N or more).
+
+    An assignment to a slice would check how many there are; numba takes seconds to compile the error message of that.
+    """
+    for i in range(out.shape[0]):
+        out[i] = values[i]

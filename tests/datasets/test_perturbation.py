@@ -78,7 +78,7 @@ def test_noise_depends_on_the_key_alone():
     here = [one(k) for k in keys]
     assert len({tuple(v) for v in here}) == len(keys)
     assert [one(k) for k in keys[::-1]] == here[::-1]
-    with multiprocessing.get_context("fork").Pool(2) as pool:
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
         assert pool.map(one, keys) == here
     noise = PoseNoise("collaborators", 0.3, 0.01, 5)
     forward = moved(snapshot(), noise.apply(snapshot(), 0))

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from manyeyes._jit import F32x1, F32x2, F32x4, I64x1, njit
+from manyeyes._jit import F32x1, F32x2, F32x4, I64x1, njit, set_row
 from manyeyes.ops._sparse_conv_kernels import HAS_BFLOAT16, LANES, add_products, empty_rows, panels
 from manyeyes.ops._window_attention_kernels import WindowRuns
 from manyeyes.ops._window_softmax_kernels import FAST, attend, power_of_two
@@ -122,7 +122,9 @@ def _block(
     # A head's queries of a tile are read before its results are written.
     attend(q.reshape(-1), k.reshape(-1), v.reshape(-1), q.reshape(-1), heads, channels // heads, order, start)
     out = empty_rows(n, channels)
-    out[:] = x + vectors.output
+    for i in range(n):
+        for c in range(channels):
+            out[i, c] = x[i, c] + vectors.output[c]
     for a in range(0, n, CHUNK):
         b = min(a + CHUNK, n)
         there, some = normed[: b - a], out[a:b]
@@ -156,7 +158,7 @@ def add_bias_rows(n: int, bias: F32x1) -> F32x2:  # pragma: no cover
     """Return (n, outputs): what the products are added to."""
     out = empty_rows(n, bias.shape[0])
     for i in range(n):
-        out[i] = bias
+        set_row(out[i], bias)
     return out
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from manyeyes._jit import F32x1, F32x2, F32x4, F32x5, I64x1, njit
+from manyeyes._jit import F32x1, F32x2, F32x4, F32x5, I64x1, njit, set_row
 from manyeyes.ops._sparse_conv_kernels import empty_rows
 from manyeyes.ops.folded_conv import apply_layers, convolve_up
 from manyeyes.ops.sparse_index import (
@@ -130,7 +130,7 @@ def merge_levels(fine: Level, coarse: Level, coarsest: Level, lattice: BatchLatt
     quarter = _coarser(half)
     n, m, channels = fine.key.shape[0], coarse.key.shape[0], fine.features.shape[1]
     key = np.empty(n + m + coarsest.key.shape[0], np.int64)
-    key[:n] = fine.key
+    set_row(key[:n], fine.key)
     collect_finer(coarse.key, half.rows, half.columns, lattice.rows, lattice.columns, 2, key[n : n + m])
     collect_finer(coarsest.key, quarter.rows, quarter.columns, lattice.rows, lattice.columns, 4, key[n + m :])
     size = lattice.batch_size * lattice.rows * lattice.columns
@@ -173,5 +173,6 @@ def prune_level(
         count += one / (one + np.exp(-logit[i])) > threshold
     key, features = np.empty(count, np.int64), empty_rows(count, level.features.shape[1])
     for k in range(count):
-        key[k], features[k] = level.key[rows[k]], level.features[rows[k]]
+        key[k] = level.key[rows[k]]
+        set_row(features[k], level.features[rows[k]])
     return Level(key, features), logit

@@ -26,7 +26,7 @@ from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 from torch import Tensor
 
-from manyeyes._jit import F32x1, F32x2, F32x4, I32x2, I64x1, njit
+from manyeyes._jit import F32x1, F32x2, F32x4, I32x2, I64x1, njit, set_row
 from manyeyes.ops.sparse_index import Pairs
 
 LANES = 16
@@ -127,7 +127,7 @@ def convolve(
     """
     source, target, counts = pairs
     for o in range(out.shape[0]):
-        out[o] = bias
+        set_row(out[o], bias)
     factors = _as_factors(x, weight)
     if is_symmetric:
         rows = np.arange(x.shape[0])

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from manyeyes._jit import F32x1, F32x2, F32x4, F32x5, njit
+from manyeyes._jit import F32x1, F32x2, F32x4, F32x5, njit, set_row
 from manyeyes.ops._sparse_conv_kernels import HAS_BFLOAT16, LANES, add_products, convolve, empty_rows, panels
 from manyeyes.ops.sparse_index import NeighbourMap, Pairs
 
@@ -144,7 +144,7 @@ def convolve_up(
     n = fine.shape[0]
     out, rows = empty_rows(n, bias.shape[0]), np.arange(n)
     for i in range(n):
-        out[i] = bias
+        set_row(out[i], bias)
     add_products(fine, lateral, 0, 1, rows, rows, np.full(1, n), out)
     add_products(x, weight, 0, 1, pairs.source, pairs.target, pairs.counts, out)
     flat = out.reshape(-1)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from manyeyes._jit import Boolx1, F64x1, F64x2, njit
+from manyeyes._jit import Boolx1, F64x1, F64x2, njit, set_row
 from manyeyes.datatypes import ShapeError
 
 MAX_CANDIDATES = 1000
@@ -102,13 +102,15 @@ def _compute_shared_area(
             after = k + 1 if k + 1 < count else 0
             p, q = half - sign * ring[k, axis], half - sign * ring[after, axis]
             if p >= 0:
-                clipped[kept] = ring[k]
+                set_row(clipped[kept], ring[k])
                 kept += 1
             if (p > 0 and q < 0) or (p < 0 and q > 0):
-                clipped[kept] = ring[k] + (ring[after] - ring[k]) * (p / (p - q))
+                for c in range(2):
+                    clipped[kept, c] = ring[k, c] + (ring[after, c] - ring[k, c]) * (p / (p - q))
                 kept += 1
         count = kept
-        ring[:count] = clipped[:count]
+        for k in range(count):
+            set_row(ring[k], clipped[k])
     area = 0.0
     for k in range(1, count - 1):
         area += (ring[k, 0] - ring[0, 0]) * (ring[k + 1, 1] - ring[0, 1])

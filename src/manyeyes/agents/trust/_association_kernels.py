@@ -61,7 +61,9 @@ def match_claims(
         begin, end = first[n], first[n + 1]
         if begin == end:
             continue
-        is_own[begin:end] = find_partners(xy[begin:end], own, gate_m[begin:end]) >= 0
+        partner = find_partners(xy[begin:end], own, gate_m[begin:end])
+        for row in range(len(partner)):
+            is_own[begin + row] = partner[row] >= 0
         for k in range(len(first) - 1):
             third = xy[first[k] : first[k + 1]]
             if k == n or not is_trusted[k] or not len(third):

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from manyeyes._jit import F64x1, I8x2, I64x1, U8x1, njit
+from manyeyes._jit import F64x1, I8x2, I64x1, U8x1, njit, set_row
 
 
 @njit(cache=True, nogil=True)
@@ -42,14 +42,14 @@ def add_checks(
     for i in range(num):
         found[i, 0] = evidence[i]
         if track[i] >= 0:
-            found[i, 1:] = checks[track[i], : width - 1]
+            set_row(found[i, 1:], checks[track[i]])
             supported[i], refuted[i] = supported_ns[track[i]], refuted_ns[track[i]]
         if evidence[i] == is_supported:
             supported[i] = now_ns
         if evidence[i] == is_refuted:
             refuted[i] = now_ns
     for i in range(count):
-        found[num + i] = checks[rows[i]]
+        set_row(found[num + i], checks[rows[i]])
         claimed[num + i] = claimed_ns[rows[i]]
         supported[num + i], refuted[num + i] = supported_ns[rows[i]], refuted_ns[rows[i]]
     return found, claimed, supported, refuted, rows[:count]

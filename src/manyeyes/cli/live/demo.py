@@ -214,7 +214,7 @@ def _run_processes(
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     # The end of this process ends those of the agents, too.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     processes = [subprocess.Popen(command, env=environment, **pipes) for command in commands]
     try:
         with console.status("Starting the agents"):
@@ -235,6 +235,7 @@ def _run_processes(
         return rate, text
     finally:
         _end(processes)
+        signal.signal(signal.SIGTERM, before)
 
 
 def _read_ready(process: subprocess.Popen[str]) -> float:

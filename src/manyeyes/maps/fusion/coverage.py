@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import Boolx1, F64x2, I64x1, I64x2, njit
+from manyeyes._jit import Boolx1, F64x2, I64x1, I64x2, njit, set_row
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays
 
 Floats = NDArray[np.float64]
@@ -89,7 +89,8 @@ def fill_rings(corners: F64x2, first: I64x1) -> I64x2:  # pragma: no cover - com
                     continue
                 if n == len(rows):
                     longer = np.empty((2 * n, 3), np.int64)
-                    longer[:n] = rows
+                    for r in range(n):
+                        set_row(longer[r], rows[r])
                     rows = longer
                 rows[n, 0], rows[n, 1], rows[n, 2] = iy, begin, end
                 n += 1

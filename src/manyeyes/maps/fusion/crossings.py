@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, njit
+from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, njit, set_row
 from manyeyes.datatypes.map_element import CROSSING
 from manyeyes.maps.fusion.existence import (
     MATCHED,
@@ -175,11 +175,12 @@ def _hulls(first: I64x1, points: F64x2) -> _OpenRings:  # pragma: no cover - com
                     <= 0.0
                 ):
                     n -= 1
-                hull[n] = p
+                set_row(hull[n], p)
                 n += 1
             n -= 1  # the last point of one half is the first of the other
         n = min(n, len(ring))
-        out[filled : filled + n] = hull[:n]
+        for i in range(n):
+            set_row(out[filled + i], hull[i])
         filled += n
         out_first[r + 1] = filled
     return _OpenRings(out_first, out[:filled].copy())

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, I64x2, U8x2, njit
+from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, I64x2, U8x2, njit, set_row
 from manyeyes.datatypes.map_element import take_rows
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED
 from manyeyes.maps.fusion.observation_arrays import DAY_NS, FieldsOfView, ObservationArrays, compute_visibility, is_line
@@ -435,7 +435,7 @@ def new_agent_scratch(count: int) -> AgentScratch:  # pragma: no cover - compile
 def doubled(rows: I64x1) -> I64x1:  # pragma: no cover - compiled
     """Return the same rows at the start of an array of twice the length."""
     bigger = np.empty(2 * len(rows), np.int64)
-    bigger[: len(rows)] = rows
+    set_row(bigger[: len(rows)], rows)
     return bigger
 
 

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, njit
+from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, njit, set_row
 from manyeyes.datatypes.map_element import CROSSING, KINDS, STYLES, MapElements, take_rows
 from manyeyes.maps.elements.observation import Observation
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED, VectorMap
@@ -670,7 +670,7 @@ def _match_stations(
 def _resize(values: F64x1, size: int) -> F64x1:  # pragma: no cover - compiled
     """Copy values to the start of an array of another size."""
     out = np.empty(size)
-    out[: len(values)] = values
+    set_row(out[: len(values)], values)
     return out
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from torch import nn
 
-from manyeyes._jit import F32x1, F32x2, F32x4, I64x1, njit
+from manyeyes._jit import F32x1, F32x2, F32x4, I64x1, njit, set_row
 from manyeyes.ops._sparse_conv_kernels import LANES, add_products, empty_rows, panels
 
 
@@ -69,7 +69,7 @@ def _add_layers(inputs: F32x2, layers: LayerPair, out: F32x2) -> None:  # pragma
     rows, counts = np.arange(n), np.full(1, n)
     hidden = empty_rows(n, layers.bias.shape[0])
     for i in range(n):
-        hidden[i] = layers.bias
+        set_row(hidden[i], layers.bias)
     add_products(inputs, layers.inner, 0, 1, rows, rows, counts, hidden)
     flat = hidden.reshape(-1)
     for i in range(np.uintp(flat.shape[0])):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from manyeyes._jit import F32x1, F32x2, I64x1, njit
+from manyeyes._jit import F32x1, F32x2, I64x1, njit, set_row
 from manyeyes.ops._attention_block_kernels import (
     CHUNK,
     BlockMatrices,
@@ -77,7 +77,8 @@ def _gather(features: F32x2, offsets: F32x2, rows: I64x1) -> tuple[F32x2, F32x2]
     """Return features (K, C) and offsets (K, 2) of rows (K,)."""
     some, places = empty_rows(rows.shape[0], features.shape[1]), np.empty((rows.shape[0], 2), np.float32)
     for i in range(rows.shape[0]):
-        some[i], places[i] = features[rows[i]], offsets[rows[i]]
+        set_row(some[i], features[rows[i]])
+        set_row(places[i], offsets[rows[i]])
     return some, places
 
 

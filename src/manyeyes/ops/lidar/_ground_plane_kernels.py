@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from manyeyes._jit import F32x2, F64x1, F64x2, I32x1, njit
+from manyeyes._jit import F32x2, F64x1, F64x2, I32x1, njit, set_row
 
 
 class Tolerance(NamedTuple):
@@ -98,7 +98,7 @@ def find_consensus(
                 score += weight[n] * (1.0 - above * above)
         if score > best_score:
             best_score = score
-            best[:] = plane
+            set_row(best, plane)
     return best
 
 

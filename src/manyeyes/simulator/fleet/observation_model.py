@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import F64x1, F64x2, F64x3, njit
+from manyeyes._jit import F64x1, F64x2, F64x3, njit, set_row
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DASHED, DIVIDER, NO_STYLE, STOP_LINE
 from manyeyes.maps.elements.observation import has_crossing_edges
 
@@ -181,7 +181,7 @@ def _clip_ring(ring: F64x2, noise: MapModelNoise) -> tuple[F64x2, float]:
             j = (i + 1) % len(work)
             a, b = sign * (work[i, axis] - limit), sign * (work[j, axis] - limit)
             if a >= 0.0:
-                out[n] = work[i]
+                set_row(out[n], work[i])
                 n += 1
             if (a >= 0.0) != (b >= 0.0):
                 t = a / (a - b)
