@@ -75,7 +75,7 @@ class Drive:
         return Snapshot("drive", index, frames, truth)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def drive() -> type[Drive]:
     return Drive
 

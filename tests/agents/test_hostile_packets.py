@@ -99,14 +99,22 @@ def drive_through(
     return found
 
 
+@pytest.fixture(scope="module")
+def undisturbed(drive, detector) -> dict[bool, list[tuple[Boxes, list]]]:
+    """What an ego perceives without hostile packets, by whether the caller keeps the inbox."""
+    return {own: drive_through(detector, drive, "intermediate-temporal", [], own) for own in (False, True)}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("own_inbox", [False, True], ids=["packets", "an inbox of the caller"])
 @pytest.mark.parametrize("what", WRONG)
-def test_one_whole_packet_of_wrong_tokens_changes_nothing(drive, detector, what: str, own_inbox: bool) -> None:
+def test_one_whole_packet_of_wrong_tokens_changes_nothing(
+    drive, detector, undisturbed, what: str, own_inbox: bool
+) -> None:
     """It raised in perceive, and again for as long as the history kept it."""
     honest = Agent(detector, token_encoding="float32").share(drive(2).frame(1, 2))[0]
     packet = forged(honest, 66, hostile_bodies(honest)[what], time_ns=2 * TENTH_NS)
-    clean = drive_through(detector, drive, "intermediate-temporal", [], own_inbox)
+    clean = undisturbed[own_inbox]
     struck = drive_through(detector, drive, "intermediate-temporal", [(2, packet)], own_inbox)
     assert all(torch.equal(a.bev(), b.bev()) and torch.equal(a.score, b.score) for (a, _), (b, _) in zip(clean, struck))
     assert [names for _, names in clean] == [[]] * 14
