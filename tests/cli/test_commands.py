@@ -2,6 +2,7 @@
 """The commands on a small recording with untrained weights: every file is written, every error is one line."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -79,7 +80,9 @@ def test_run_writes_table_pictures_animation_report_and_json(data, weights, tmp_
     with Image.open(tmp_path / "drive.gif") as film:
         assert film.n_frames == 2
     report = (tmp_path / "report.html").read_text()
-    assert report.count("data:image/") == 6
+    # A picture of each method for browsers without scripts, and the reliability diagram; the player replaces the animation.
+    assert report.count("data:image/png") == 5 and report.count("data:image/") == 5
+    assert re.search(r'"methods":\[\{"name":"no-fusion".*"name":"early"', report)
     assert " --split test --scenario " in report
 
 

@@ -1,18 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map page as text, and as headless Chromium draws it."""
 
-import base64
-import io
 import json
-import os
 import re
-import shutil
-import subprocess
 import time
 
 import numpy as np
 import pytest
-from PIL import Image
+from tests.viz.chromium import Browser, find_program
 
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
 from manyeyes.evaluation.maps.map_discrepancy import MapDiscrepancy
@@ -69,70 +64,13 @@ def test_a_map_without_anything_is_a_page(tmp_path) -> None:
     assert [p.name for p in (tmp_path / "new").iterdir()] == ["map.html"]
 
 
-class Browser:
-    """Chromium's DevTools protocol over a pipe: enough to open a page, ask it and photograph it."""
-
-    def __init__(self, program: str, profile: str) -> None:
-        to_read, self.to = os.pipe()
-        self.back, from_write = os.pipe()
-        flags = "--headless --no-sandbox --use-angle=swiftshader --enable-unsafe-swiftshader --hide-scrollbars"
-        command = f'exec "$0" {flags} --window-size=1000,700 --user-data-dir="$1" --remote-debugging-pipe '
-        command += f"about:blank 3<&{to_read} 4>&{from_write}"
-        self.process = subprocess.Popen(
-            ["bash", "-c", command, program, profile],
-            pass_fds=(to_read, from_write),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        os.close(to_read)
-        os.close(from_write)
-        self.held, self.count, self.session = b"", 0, None
-
-    def ask(self, method: str, **params):
-        self.count += 1
-        message = {"id": self.count, "method": method, "params": params}
-        if self.session:
-            message["sessionId"] = self.session
-        os.write(self.to, json.dumps(message).encode() + b"\0")
-        while True:
-            while b"\0" not in self.held:
-                more = os.read(self.back, 1 << 16)
-                assert more, "Chromium went away"
-                self.held += more
-            text, self.held = self.held.split(b"\0", 1)
-            answer = json.loads(text)
-            if answer.get("id") == self.count:
-                return answer["result"]
-
-    def open(self, url: str) -> None:
-        target = self.ask("Target.createTarget", url=url)["targetId"]
-        self.session = self.ask("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
-        end = time.monotonic() + 40
-        while self.value("document.body && document.body.dataset.ready") is None:
-            assert time.monotonic() < end, "the map was never drawn"
-            time.sleep(0.1)
-
-    def value(self, expression: str):
-        return self.ask("Runtime.evaluate", expression=expression)["result"].get("value")
-
-    def photograph(self) -> np.ndarray:
-        shot = base64.b64decode(self.ask("Page.captureScreenshot", format="png")["data"])
-        return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
-
-    def close(self) -> None:
-        self.process.terminate()
-        self.process.wait(20)
-        os.close(self.to)
-        os.close(self.back)
-
-
 def count(pixels: np.ndarray, colour: tuple[int, int, int]) -> int:
     return int((np.abs(pixels - colour).max(-1) < 12).sum())
 
 
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory):
-    program = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    program = find_program()
     if program is None:
         pytest.skip("no Chromium is installed: the page was checked as text only")
     made = Browser(program, str(tmp_path_factory.mktemp("profile")))

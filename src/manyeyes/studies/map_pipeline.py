@@ -231,7 +231,7 @@ def write_built_map(built: BuiltMap, out: Path, title: str) -> None:
     save_map_page(page, out / "map.html")
     area = _bounding_area(built.observed, built.truth)
     panels = [
-        MapPanel(f"What {len(observations)} observations say", built.observed, built.truth, area=area),
+        MapPanel(f"{len(observations)} observations", built.observed, built.truth, area=area),
         MapPanel("Fused map" + (", truth behind it" if built.truth else ""), built.evaluated, built.truth, area=area),
     ]
     save_figure(panels, out / "map.png")

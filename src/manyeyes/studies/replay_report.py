@@ -26,18 +26,20 @@ from manyeyes.studies import provenance
 from manyeyes.studies.replay_options import Excerpt
 from manyeyes.viz.animation import save_animation, stack_images
 from manyeyes.viz.birds_eye import draw_scene, make_scene, save_png
+from manyeyes.viz.help_chapter import make_help_chapter
 from manyeyes.viz.pose_summary import HEADINGS, PoseCorrectionSummary
 from manyeyes.viz.progress import make_progress_bars
 from manyeyes.viz.reliability import make_reliability_chapter
 from manyeyes.viz.report import Chapter, HtmlReport, ReportImage, save_report
 from manyeyes.viz.results import MethodComparison, print_comparison, summarize_comparison
+from manyeyes.viz.scene_recorder import SceneRecorder
 from manyeyes.viz.table import format_markdown
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
 REPORT = "report.html"
-WIDTH, FILM_WIDTH, FILM_FRAME_MS = 1280, 800, 200
+WIDTH, FILM_WIDTH, FILM_FRAME_MS, MAX_FILM_IMAGES = 1280, 800, 200, 25
 TITLES = {
     "no-fusion": "No fusion",
     "no-fusion-temporal": "No fusion, with the last two frames",
@@ -100,16 +102,19 @@ def replay_and_report(drive: Excerpt, detector: BoxDetector, spec: ReportSpec, c
     min_scores = {name: find_min_score(detector, name, spec.min_score) for name in spec.methods}
     metrics = {name: MetricAccumulator(name, protocol) for name in spec.methods}
     film = _Film(_select_animated(spec.methods) if spec.animate else ())
+    filmed = eval_indices[:: -(-len(eval_indices) // MAX_FILM_IMAGES)]
+    recorder = SceneRecorder(protocol, spec.methods, TITLES, min_scores, eval_indices)
     pictured_steps: list[ReplayStep] = []
     pose_summaries = {name: PoseCorrectionSummary() for name in spec.methods}
     with make_progress_bars(console) as progress:
         task = progress.add_task("Playing", total=len(eval_indices) * len(spec.methods))
         for step in replay(drive, drive.scenario, detector, spec.methods, spec.replay):
             metrics[step.method].add(step)
+            recorder.add(step)
             pose_summaries[step.method].add(step.snapshot.index, step.perception.corrections)
             if step.snapshot.index == pictured_index:
                 pictured_steps.append(step)
-            if step.method in film.methods:
+            if step.method in film.methods and step.snapshot.index in filmed:
                 film.add(step.method, _draw_step(step, grid, _make_caption(step), min_scores[step.method], FILM_WIDTH))
             progress.advance(task)
     results = [r for name, tally in metrics.items() for r in tally.compute_results(find_thresholds(detector, name))]
@@ -121,7 +126,10 @@ def replay_and_report(drive: Excerpt, detector: BoxDetector, spec: ReportSpec, c
     for chapter, summary in zip(pose_chapters, (p for p in pose_summaries.values() if p.senders)):
         for warning in summary.make_warnings():
             console.print(f"{chapter.title}: {warning}", highlight=False, soft_wrap=True)
-    pictures = _save_animation(film, spec.out) + _save_pictures(pictured_steps, comparison, grid, spec.out, min_scores)
+    _save_animation(film, spec.out)
+    pictures = _save_pictures(pictured_steps, comparison, grid, spec.out, min_scores)
+    player, shown = recorder.finish(pictured_index), _select_shown(spec.methods)
+    help_chapter = make_help_chapter(player, shown)
     config = {
         "spec": spec,
         "detector": detector.config if isinstance(detector, Detector) else type(detector).__qualname__,
@@ -138,7 +146,10 @@ def replay_and_report(drive: Excerpt, detector: BoxDetector, spec: ReportSpec, c
         pictures=pictures,
         facts=_make_facts(drive, detector, spec),
         commands=spec.commands,
-        notes=(*((comparison.footer,) if comparison.footer else ()), *_make_notes(protocol)),
+        notes=(*((comparison.footer,) if comparison.footer else ()), *_make_notes(protocol, spec.replay)),
+        player=player,
+        story=() if help_chapter is None else (help_chapter,),
+        shown=shown,
         chapters=(*pose_chapters, reliability_chapter),
         provenance=origin,
     )
@@ -171,6 +182,11 @@ def _select_animated(methods: Sequence[str]) -> tuple[str, ...]:
     return max(chosen, key=len) or tuple(methods[:1])
 
 
+def _select_shown(methods: Sequence[str]) -> str:
+    """Return the method that the report explains: the last animated one."""
+    return _select_animated(methods)[-1]
+
+
 def _draw_step(step: ReplayStep, grid: BevGrid, caption: str, min_score: float, width: int) -> Image:
     title = TITLES.get(step.method, step.method)
     received_ids = {reception.message.agent_id for reception in step.perception.received}
@@ -190,12 +206,9 @@ def _make_caption(step: ReplayStep) -> str:
     return f"{moment} · {len(sent)} messages of {sum(sent) / len(sent) / 1e3:,.1f} kB{age}"
 
 
-def _save_animation(film: _Film, out: Path) -> tuple[ReportImage, ...]:
-    if not film.images:
-        return ()
-    save_animation(film.images, out / "drive.gif", FILM_FRAME_MS)
-    names = ", below it ".join(TITLES.get(name, name).split(":")[0].lower() for name in film.methods)
-    return (ReportImage(out / "drive.gif", f"The drive at half speed: {names}.", wide=True),)
+def _save_animation(film: _Film, out: Path) -> None:
+    if film.images:
+        save_animation(film.images, out / "drive.gif", FILM_FRAME_MS)
 
 
 def _save_pictures(
@@ -229,11 +242,15 @@ def _make_facts(drive: Excerpt, detector: BoxDetector, spec: ReportSpec) -> tupl
     )
 
 
-def _make_notes(protocol: DetectionProtocol) -> tuple[str, ...]:
+def _make_notes(protocol: DetectionProtocol, config: ReplayConfig) -> tuple[str, ...]:
     x0, y0, _, x1, y1, _ = protocol.gt_range
     place = f"x from {x0:g} to {x1:g} m, y from {y0:g} to {y1:g} m around the ego"
     text = (
         f"The vehicles that the LiDAR of any agent hit are evaluated, {place}. This is one drive: its numbers show what "
         "happened here, and resolve no difference between methods; 'manyeyes evaluate' does, over many."
     )
-    return (text,)
+    wait = (
+        f"After its own sweep the ego waits {1e3 * config.latency_budget_s:.0f} ms for messages; the channel's time is part "
+        "of this wait. Compute times are of this machine, whatever else it did."
+    )
+    return text, wait

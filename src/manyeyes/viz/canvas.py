@@ -76,8 +76,7 @@ def draw_points(
     Ink adds up in a pixel and saturates; where layers meet, their colours mix by ink.
     """
     width, height = viewport.size
-    total = np.zeros(width * height, np.float32)
-    mixed = np.zeros((width * height, 3), np.float32)
+    cells, inks, colours = [], [], []
     for xy, ink, colour in layers:
         at = np.floor(viewport.to_pixels(xy)).astype(np.int64)
         inside = (
@@ -86,16 +85,19 @@ def draw_points(
             & (at[:, 1] >= viewport.top_margin)
             & (at[:, 1] < height - viewport.bottom_margin)
         )
-        cell = at[inside, 1] * width + at[inside, 0]
-        amount = np.bincount(cell, ink[inside], width * height).astype(np.float32)
-        total += amount
-        mixed += amount[:, None] * np.asarray(colour, np.float32)
+        cells.append(at[inside, 1] * width + at[inside, 0])
+        inks.append(ink[inside])
+        colours.append(np.broadcast_to(np.asarray(colour, float), (len(inks[-1]), 3)))
     image = np.empty((width * height, 3), np.uint8)
     image[:] = background
-    touched = np.flatnonzero(total)
-    ink = total[touched, None]
-    cover = 1 - np.exp(-ink)
-    image[touched] = (mixed[touched] / ink * cover + np.asarray(background, np.float32) * (1 - cover)).round()
+    if not cells:
+        return image.reshape(height, width, 3)
+    amount, colour_of = np.concatenate(inks), np.concatenate(colours)
+    touched, place = np.unique(np.concatenate(cells), return_inverse=True)
+    total = np.bincount(place, amount, len(touched))[:, None]
+    mixed = np.stack([np.bincount(place, amount * colour_of[:, k], len(touched)) for k in range(3)], 1)
+    cover = 1 - np.exp(-total)
+    image[touched] = (mixed / np.maximum(total, 1e-12) * cover + np.asarray(background, float) * (1 - cover)).round()
     return image.reshape(height, width, 3)
 
 

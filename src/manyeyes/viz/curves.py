@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _COLUMNS = 2
+_LEGEND_COLUMNS = 3
+"""Names side by side below each panel."""
 _MAX_UPRIGHT_LETTERS = 40
 """Letters below an axis beyond which names are written aslant."""
 _BYTES_TICKS = (1 << 9, 1 << 11, 1 << 13, 1 << 15, 1 << 17, 1 << 19)
@@ -66,7 +68,7 @@ def save_curves(panels: Sequence[CurvePanel], path: Path) -> None:
         frameon=False,
         fontsize=9,
         loc="outside lower center",
-        ncols=6,
+        ncols=_LEGEND_COLUMNS * columns,
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_replace(path, durable=False) as temporary:

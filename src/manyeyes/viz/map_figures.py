@@ -60,6 +60,7 @@ def save_figure(panels: Sequence[MapPanel], path: Path, columns: int = 2, width_
     ratio = np.mean([_aspect_ratio(panel) for panel in panels])
     size = (width_in * columns, (width_in * ratio + 0.5) * rows)
     figure, axes = pyplot.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
     for axis in axes.ravel()[len(panels) :]:
         axis.set_axis_off()
     for panel, axis in zip(panels, axes.ravel()):

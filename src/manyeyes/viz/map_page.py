@@ -8,10 +8,8 @@ lies beside this file with its licence, as published on npm.
 from __future__ import annotations
 
 import html
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +22,7 @@ from manyeyes.evaluation.maps.change_summary import MapChange
 from manyeyes.evaluation.maps.map_discrepancy import MapDiscrepancy, find_discrepancies
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.roads.transverse_mercator import degrees_from_metres
+from manyeyes.viz.web_assets import read_asset, to_safe_json
 
 Floats = NDArray[np.float64]
 _DEGREES = 7
@@ -125,12 +124,12 @@ def render(page: MapPage) -> str:
             '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">',
             '<meta name="viewport" content="width=device-width"><link rel="icon" href="data:,">',
             f"<title>{_text(page.title)}</title>",
-            f"<style>{_read_asset('vendor/maplibre-gl.css')}</style><style>{_read_asset('web/map_page.css')}</style></head><body>",
+            f"<style>{read_asset('vendor/maplibre-gl.css')}</style><style>{read_asset('web/map_page.css')}</style></head><body>",
             f'<div id="map"></div><div id="panel"><h1>{_text(page.title)}</h1><ul class="facts">{facts}</ul>',
             f'<div id="layers"></div>{_legend(names)}</div>',
-            f'<script type="application/json" id="data">{_to_safe_json(data)}</script>',
-            f"<script>{_read_asset('vendor/maplibre-gl.js')}</script>",
-            f"<script>{_read_asset('web/map_page.js')}</script></body></html>\n",
+            f'<script type="application/json" id="data">{to_safe_json(data)}</script>',
+            f"<script>{read_asset('vendor/maplibre-gl.js')}</script>",
+            f"<script>{read_asset('web/map_page.js')}</script></body></html>\n",
         )
     )
 
@@ -191,18 +190,6 @@ def _legend(names: dict[str, str]) -> str:
         f'{stops})"></div><div class="ends"><span>0</span><span>1</span></div><b>Truth and observations</b>'
         f"<div>{kinds}</div><b>Disagreement</b><div>{discrepancy_items}</div></div>"
     )
-
-
-def _read_asset(name: str) -> str:
-    """Return a file beside this one, without MapLibre's comment that points to a source map."""
-    text = (resources.files("manyeyes.viz") / name).read_text(encoding="utf-8")
-    lines = [line for line in text.splitlines() if not line.startswith("//# sourceMappingURL=")]
-    return "\n".join(lines).replace("</script", "<\\/script")
-
-
-def _to_safe_json(value: object) -> str:
-    """Return JSON that cannot end the script element that holds it."""
-    return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def _text(value: str) -> str:

@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Self-contained HTML report of a run: tables, images, animation, commands, configuration."""
+"""Self-contained HTML report of a run: player of the drive, plots, tables, images, commands, configuration.
+
+Style and script are in ``viz/web``; the page holds its data as JSON and fetches nothing.
+"""
 
 from __future__ import annotations
 
 import base64
 import html
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,57 +18,18 @@ from typing import Any
 from manyeyes._io import atomic_write_text
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.statistics.comparison import Comparison
+from manyeyes.viz.report_columns import COLUMN_DESCRIPTIONS
+from manyeyes.viz.scene_player import ScenePlayer, to_json
 from manyeyes.viz.table import (
-    DATA_AGE,
     DIFFERENCE_HEADINGS,
-    LOG2_BYTES,
     NOT_RUN,
     MethodRow,
     format_difference_cells,
     format_lines,
 )
+from manyeyes.viz.web_assets import read_asset, to_safe_json
 
 MIME = {".png": "image/png", ".gif": "image/gif", ".webp": "image/webp", ".svg": "image/svg+xml"}
-
-STYLE = """
-:root { --ink: #263238; --soft: #607d8b; --line: #e3e8eb; --wash: #f6f8f9; --accent: #1976d2; }
-* { box-sizing: border-box; }
-body { margin: 0; color: var(--ink); background: #fff;
-  font: 15px/1.55 system-ui, "Segoe UI", Helvetica, Arial, sans-serif; }
-main { max-width: 1180px; margin: 0 auto; padding: 40px 24px 72px; }
-h1 { font-size: 30px; line-height: 1.2; margin: 0 0 6px; letter-spacing: -.01em; }
-h2 { font-size: 19px; margin: 44px 0 12px; padding-top: 16px; border-top: 1px solid var(--line); }
-p { margin: 0 0 12px; max-width: 78ch; }
-.lead { color: var(--soft); font-size: 17px; }
-.facts { display: flex; flex-wrap: wrap; gap: 10px; margin: 20px 0 0; padding: 0; list-style: none; }
-.facts li { background: var(--wash); border: 1px solid var(--line); border-radius: 8px; padding: 8px 14px; }
-.facts b { display: block; font-size: 12px; font-weight: 500; color: var(--soft); }
-.wide { overflow-x: auto; margin-bottom: 12px; }
-table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums; }
-th, td { text-align: right; padding: 8px 12px; border-bottom: 1px solid var(--line); white-space: nowrap; }
-th { font-size: 12.5px; font-weight: 600; color: var(--soft); }
-th:first-child, td:first-child { text-align: left; font-weight: 600; }
-td.absent { color: #a9b6bd; }
-figure { margin: 0 0 22px; }
-figure img { display: block; width: 100%; height: auto; border: 1px solid var(--line); border-radius: 8px; }
-figcaption { color: var(--soft); font-size: 13.5px; margin-top: 6px; }
-.pair { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 480px), 1fr)); gap: 4px 20px; }
-pre { background: var(--wash); border: 1px solid var(--line); border-radius: 8px; padding: 12px 14px;
-  overflow-x: auto; font-size: 13px; }
-details { margin: 0 0 10px; } summary { cursor: pointer; color: var(--accent); }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: 2px 18px; margin: 0; }
-dt { font-weight: 600; } dd { margin: 0; color: var(--soft); }
-@media print { main { padding: 0; } }
-"""
-
-COLUMN_DESCRIPTIONS = (
-    ("AP@0.5, AP@0.7", "average precision at rotated bird's-eye IoU 0.5 and 0.7, detections of all frames sorted by score, "
-     "with the 95 % confidence interval over scenarios where there is more than one"),
-    ("bytes/message", "mean size of an agent's message, with all packets and headers"),
-    (LOG2_BYTES, "the base-2 logarithm of bytes/message"),
-    (DATA_AGE, "mean age of received data when it is fused: capture, share and channel"),
-    ("share [ms], perceive [ms]", "mean computing time of one call on this machine"),
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -88,7 +53,11 @@ class Chapter:
 
 @dataclass(frozen=True)
 class HtmlReport:
-    """Content of a report. facts: short (name, value) pairs; provenance: as returned by write_json."""
+    """Content of a report. facts: short (name, value) pairs; provenance: as returned by write_json.
+
+    player: frames of the drive; its methods are those of the rows. pictures: without a player on the page, with one for browsers
+    without scripts. story: chapters before the results; shown: the method whose tab is open first.
+    """
 
     title: str
     lead: str
@@ -100,51 +69,87 @@ class HtmlReport:
     notes: tuple[str, ...] = ()
     chapters: tuple[Chapter, ...] = ()
     provenance: dict[str, Any] = field(default_factory=dict)
+    player: ScenePlayer | None = None
+    story: tuple[Chapter, ...] = ()
+    shown: str = ""
 
 
 def render(report: HtmlReport) -> str:
-    """Render the page as HTML with embedded images."""
+    """Render the page as HTML with embedded images, style and script."""
     parts = [f"<h1>{_escape(report.title)}</h1>", f'<p class="lead">{_escape(report.lead)}</p>']
     if report.facts:
         items = "".join(f"<li><b>{_escape(name)}</b>{_escape(value)}</li>" for name, value in report.facts)
         parts.append(f'<ul class="facts">{items}</ul>')
+    parts += _drive_parts(report)
+    parts += [part for chapter in report.story for part in _chapter_parts(chapter)]
     if report.rows:
-        columns = "".join(f"<dt>{_escape(name)}</dt><dd>{_escape(what)}</dd>" for name, what in COLUMN_DESCRIPTIONS)
         parts += [
             "<h2>Results</h2>",
+            read_asset("web/report_plots.html"),
             _table(*_split_headings(format_lines(report.rows))),
-            f"<details><summary>Definitions of columns</summary><dl>{columns}</dl></details>",
         ]
     if report.differences:
         parts += [_table(DIFFERENCE_HEADINGS, [format_difference_cells(d) for d in report.differences])]
     parts += [f"<p>{_escape(note)}</p>" for note in report.notes]
-    wide, pairs = [p for p in report.pictures if p.wide], [p for p in report.pictures if not p.wide]
-    if wide:
-        parts += ["<h2>Animation</h2>", *(_figure(p) for p in wide)]
-    if pairs:
-        parts += [
-            "<h2>One frame, bird's-eye view</h2>",
-            f'<div class="pair">{"".join(_figure(p) for p in pairs)}</div>',
-        ]
-    for chapter in report.chapters:
-        parts += [
-            f"<h2>{_escape(chapter.title)}</h2>",
-            f"<p>{_escape(chapter.text)}</p>",
-            *map(_figure, chapter.pictures),
-        ]
-        if chapter.table:
-            parts.append(_table(chapter.table[0], chapter.table[1:]))
+    parts += [part for chapter in report.chapters for part in _chapter_parts(chapter)]
     if report.commands:
         parts += ["<h2>Commands</h2>", f"<pre>{_escape(chr(10).join(report.commands))}</pre>"]
     if report.provenance:
         dump = _escape(json.dumps(report.provenance, indent=2, default=str))
         parts += ["<h2>Provenance</h2>"]
         parts += [f"<details><summary>Configuration, seed, versions, commit</summary><pre>{dump}</pre></details>"]
-    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{_escape(report.title)}</title>'
+    head = (
+        '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+        f'<link rel="icon" href="data:,"><title>{_escape(report.title)}</title><style>{read_asset("web/report.css")}</style>'
+    )
+    data = f'<script type="application/json" id="report-data">{to_safe_json(_page_data(report))}</script>'
+    script = f"{data}\n<script>{read_asset('web/report.js')}</script>"
     body = "\n".join(parts)
-    style = f"<style>{STYLE}</style>"
-    page = f'<html lang="en"><head>{head}{style}</head><body><main>\n{body}\n</main></body></html>'
-    return f"<!doctype html>\n{page}\n"
+    return (
+        f'<!doctype html>\n<html lang="en"><head>{head}</head><body><main>\n{body}\n</main>\n{script}</body></html>\n'
+    )
+
+
+def _drive_parts(report: HtmlReport) -> list[str]:
+    """Return the player, or the pictures where there is none."""
+    wide, pairs = [p for p in report.pictures if p.wide], [p for p in report.pictures if not p.wide]
+    pictures = "".join(map(_figure, wide))
+    pictures += f'<div class="pair">{"".join(map(_figure, pairs))}</div>' if pairs else ""
+    if report.player is not None:
+        parts = ["<h2>The drive from above</h2>", read_asset("web/report_player.html")]
+        return parts + ([f"<noscript>{pictures}</noscript>"] if pictures else [])
+    return ["<h2>From above</h2>", pictures] if pictures else []
+
+
+def _chapter_parts(chapter: Chapter) -> list[str]:
+    parts = [f"<h2>{_escape(chapter.title)}</h2>", f"<p>{_escape(chapter.text)}</p>"]
+    parts += [_table(chapter.table[0], chapter.table[1:])] if chapter.table else []
+    return [*parts, *map(_figure, chapter.pictures)]
+
+
+def _page_data(report: HtmlReport) -> dict[str, Any]:
+    """Return what the script draws: numbers of the methods, of the first class where there are several, and the player."""
+    player = report.player
+    air_ms = {method.name: method.air_ms for method in player.methods} if player else {}
+    rows = {row.method: row for row in reversed(report.rows)}
+    methods = [
+        {
+            "label": name,
+            "ap": _number(row.ap50.value) if row.ap50 else None,
+            "interval": [row.ap50.low, row.ap50.high] if row.ap50 and row.ap50.num_scenarios > 1 else None,
+            "bytes": _number(row.bytes_per_message),
+            "share": _number(row.share_ms) if row.bytes_per_message else None,
+            "air": _number(air_ms.get(name)),
+            "perceive": _number(row.perceive_ms),
+        }
+        for name, row in reversed(rows.items())
+    ]
+    return {"methods": methods, "player": None if player is None else to_json(player), "shown": report.shown}
+
+
+def _number(value: float | None) -> float | None:
+    """Return a number as JSON can hold it."""
+    return None if value is None or not math.isfinite(value) else round(value, 4)
 
 
 def save_report(report: HtmlReport, path: Path) -> None:
@@ -161,9 +166,15 @@ def _split_headings(lines: Sequence[tuple[str, ...]]) -> tuple[tuple[str, ...], 
 
 
 def _table(headings: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
-    head = "".join(f"<th>{_escape(heading)}</th>" for heading in headings)
+    """Return a table; below each heading stands what the column means."""
+    head = "".join(f"<th>{_escape(heading)}{_describe_column(heading)}</th>" for heading in headings)
     body = "".join(f"<tr>{''.join(_cell(c) for c in line)}</tr>" for line in lines)
     return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _describe_column(heading: str) -> str:
+    description = COLUMN_DESCRIPTIONS.get(heading)
+    return f"<small>{_escape(description)}</small>" if description else ""
 
 
 def _cell(text: str) -> str:

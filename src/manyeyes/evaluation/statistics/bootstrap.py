@@ -137,7 +137,11 @@ def bootstrap(
     """Return the AP (or another statistic) of matched frames on n resamples, made once for any number of differences."""
     pool = _pool_matches(matches, protocol)
     value = float(statistic(pool, np.ones((1, len(pool.names)), dtype=np.int64))[0])
-    samples = statistic(pool, draw_resamples(len(pool.names), num_resamples, seed))
+    weights = draw_resamples(len(pool.names), num_resamples, seed)
+    # All resamples of one scenario are equal.
+    samples = (
+        statistic(pool, weights) if len(pool.names) > 1 else np.repeat(statistic(pool, weights[:1]), num_resamples)
+    )
     return BootstrapSamples(pool.names, pool.n_gt, value, samples, confidence_level, protocol.count_frames_without_det)
 
 
