@@ -13,7 +13,6 @@ pytest.importorskip("pyarrow", reason="the 'map' extra is not installed")
 pytest.importorskip("shapely", reason="the 'map' extra is not installed")
 
 from manyeyes.cli import main as cli
-from manyeyes.cli.demo_map import describe_drive_map
 from manyeyes.datasets.registry import open_recording
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.datatypes.map_element import KINDS
@@ -133,30 +132,6 @@ def test_a_model_predicts_where_no_truth_is_known(weights, tmp_path) -> None:
     np.testing.assert_allclose(made.map_server.observations[0].pose, [-70.0, -20.0, 0.0], atol=1e-5)
     write_built_map(made, tmp_path, "Nowhere")
     assert not (tmp_path / "truth").exists() and (tmp_path / "map.png").exists()
-
-
-@pytest.mark.slow
-def test_the_demos_map_is_that_of_its_drive_where_a_model_ships(weights, tmp_path, monkeypatch) -> None:
-    from rich.console import Console
-
-    from manyeyes.cli.demo import _make_map_chapters
-
-    monkeypatch.setattr(pretrained, "list_map_models", lambda: (pretrained.DEFAULT_MAP_MODEL,))
-    monkeypatch.setattr(pretrained, "load_map_model", lambda load=pretrained.load_map_model: load(weights))
-    (chapter,), summary = _make_map_chapters(Crossroads(("elsewhere_0",), frames=11), tmp_path, 0, Console(quiet=True))
-    assert (
-        summary.startswith("One map from 8 messages") and summary.endswith("not evaluated.") and summary in chapter.text
-    )
-    assert [p.path for p in chapter.pictures] == [tmp_path / "map.png"] and (tmp_path / "map.html").is_file()
-
-
-def test_the_map_of_a_drive_is_summarised_in_one_line(built) -> None:
-    summary = describe_drive_map(built.stats)
-    assert (
-        f"mAP {built.stats.scores.mean_ap('maptr'):.2f}" in summary
-        and "unfused" in summary
-        and summary.count("\n") == 0
-    )
 
 
 def test_the_oracle_needs_a_true_map() -> None:

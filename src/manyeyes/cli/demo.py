@@ -3,7 +3,8 @@
 
 Three connected vehicles and a roadside unit meet at a crossing with traffic, buildings and occlusion. Detections of no fusion,
 late, intermediate and early fusion, all with the same memory of two frames, are compared on the same channel; --methods selects
-others. A map is built too: of the drive, where a map model ships; else of a crossroads by a simulated fleet.
+others. The report plays the drive with every method, and shows what the ego alone misses and who supplied it. A map of a crossroads
+is fused too, from the local maps of a simulated fleet.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ from manyeyes.studies.replay_options import WITH_MEMORY, ReplayOptions, display_
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from manyeyes.datasets.base import Recording
     from manyeyes.viz.report import Chapter
 
 PRESET = "demo"
@@ -71,10 +71,10 @@ def _run_demo(options: Options) -> None:
     detector = pretrained.load(options.replay_options.weights)
     folder = options.out / "recording" / f"seed-{options.seed}"
     with make_progress_bars(console) as progress:
-        task = progress.add_task("Simulating", total=None)
+        task = progress.add_task("Simulating", total=1)
 
         def report_scene(at: RecordingProgress) -> None:
-            progress.update(task, total=at.total, completed=at.done)
+            progress.update(task, completed=at.done)
 
         simulate(PRESET, folder, options.seed, 1, report_scene, options.towns)
     drive = make_excerpt(open_recording(folder, "test"), None, options.frames)
@@ -84,7 +84,8 @@ def _run_demo(options: Options) -> None:
     spec = ReportSpec(
         out=options.out,
         title=f"manyeyes demo: one drive, {len(options.replay_options.methods)} methods",
-        lead=f"Simulated in {town}, which the shipped weights never saw. All that passes between agents is bytes.",
+        lead=f"Three vehicles and a roadside unit in {town}, which the shipped weights never saw: what the ego alone misses, who "
+        "supplies it, and what it costs in bytes and milliseconds. All that passes between agents is bytes.",
         methods=options.replay_options.methods,
         replay=replay,
         weights=display_name(options.replay_options.weights),
@@ -102,23 +103,18 @@ def _run_demo(options: Options) -> None:
     )
     report, report_path = replay_and_report(drive, detector, spec, console), options.out / REPORT
     # The report of the detections is on disk before the map begins, so that nothing of it is lost where the map fails.
-    chapters, summary = _make_map_chapters(drive, options.out / "map", options.seed, console)
-    save_report(replace(report, chapters=(*chapters, *report.chapters)), report_path)
+    chapter, summary = _make_map_chapter(options.out / "map", options.seed, console)
+    save_report(replace(report, chapters=(chapter, *report.chapters)), report_path)
     console.print(f"\n{summary}", highlight=False, soft_wrap=True)
     console.print(
         f"\nPictures, animation and JSON are in {options.out}; open {report_path}", highlight=False, soft_wrap=True
     )
 
 
-def _make_map_chapters(drive: Recording, out: Path, seed: int, console: Console) -> tuple[tuple[Chapter, ...], str]:
+def _make_map_chapter(out: Path, seed: int, console: Console) -> tuple[Chapter, str]:
     """Return the map part of the report, and its summary in one line."""
-    from manyeyes.cli.demo_map import describe_crossing_map, map_crossing, map_drive
-    from manyeyes.models import pretrained
+    from manyeyes.cli.demo_map import describe_crossing_map, map_crossing
 
-    if pretrained.DEFAULT_MAP_MODEL in pretrained.list_map_models():
-        with console.status("Mapping the drive"):
-            summary, chapter = map_drive(drive, pretrained.load_map_model(), out, seed)
-        return (chapter,), summary
     with console.status("Mapping a crossroads"):
         stats, chapter = map_crossing(out, seed)
-    return (chapter,), describe_crossing_map(stats)
+    return chapter, describe_crossing_map(stats)
