@@ -102,6 +102,8 @@ def test_evaluate_compares_methods_over_scenarios(data, weights, tmp_path, capsy
     assert run("evaluate", "--data", data, "--split", "test", "--weights", weights, *words) == 0
     assert "intermediate - no-fusion" in capsys.readouterr().out
     held = json.loads((tmp_path / "results.json").read_text())["result"]
+    page = (tmp_path / "report.html").read_text()
+    assert "intermediate - no-fusion" in page and '"player":null' in page and '"label":"intermediate"' in page
     (half, seven) = held["differences"]
     assert (half["metric"], seven["metric"]) == ("AP@0.5", "AP@0.7")
     assert half["description"] == "intermediate - no-fusion" and half["interval"]["num_scenarios"] == 2

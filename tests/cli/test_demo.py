@@ -11,10 +11,21 @@ import pytest
 pytest.importorskip("libsumo", reason="the 'sim' extra is not installed")
 
 from manyeyes.cli import main as cli
+from manyeyes.cli.demo_map import describe_crossing_map, map_crossing
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
 from manyeyes.studies.replay_options import ALL_METHODS
+
+
+@pytest.mark.slow
+def test_the_fused_map_is_better_than_its_input_in_each_number(tmp_path: Path) -> None:
+    stats, chapter = map_crossing(tmp_path, seed=0)
+    assert chapter.table[0] == ("map", "mAP", "precision", "F1", "duplication")
+    fused, union = ([float(cell) for cell in row[1:]] for row in chapter.table[1:])
+    assert all(ours > theirs for ours, theirs in zip(fused[:3], union[:3])) and 1 <= fused[3] < union[3]
+    line = describe_crossing_map(stats)
+    assert f"mAP {fused[0]:.2f}" in line and f"unfused, {union[0]:.2f} and {union[2]:.2f}" in line
 
 
 @pytest.mark.slow

@@ -67,3 +67,11 @@ def test_agents_are_counted_in_whole_numbers() -> None:
     axes = Figure().add_subplot()
     curves._draw(axes, CurvePanel("", "agents", "AP", (Curve("c", at(0.5, 0.6, 0.7), (1.0, 2.0, 3.0)),)), ["c"])
     assert all(float(tick).is_integer() for tick in axes.get_xticks())
+
+
+def test_the_legend_of_one_panel_is_not_cut_off(tmp_path) -> None:
+    names = ("calibrated", *(f"{name}-temporal" for name in ("no-fusion", "late", "intermediate", "early")))
+    curves = tuple(Curve(name, at(0.8, 0.7 - 0.1 * k), (0.0, 0.4)) for k, name in enumerate(names))
+    pixels = drawn([CurvePanel("Reliability", "score", "fraction", curves)], tmp_path / "x.png")
+    legend = pixels[-75:]
+    assert (legend[:, :4] == 255).all() and (legend[:, -4:] == 255).all() and (legend < 255).any()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -194,9 +195,14 @@ def test_columns_are_explained_in_their_headings(page: Browser) -> None:
 
 
 def test_a_page_without_a_player_shows_its_plots(page: Browser, tmp_path: Path) -> None:
-    rows = (MethodRow("late", Interval(0.8, 0.7, 0.9, 0.95, 5), None, 2048.0, None, None, None),)
+    unknown = Interval(math.nan, math.nan, math.nan, 0.95, 5)
+    rows = (
+        MethodRow("late", Interval(0.8, 0.7, 0.9, 0.95, 5), None, 2048.0, None, None, None),
+        MethodRow("early", unknown, unknown, 2048.0, math.nan, math.nan, math.nan),
+    )
     save_report(HtmlReport("A split", "One method.", rows), tmp_path / "plain.html")
     first = page.session
     page.open((tmp_path / "plain.html").as_uri())
     assert page.value("document.body.dataset.ready") == "0" and page.value("byId('plot-bytes').width") > 100
+    assert page.value("held.methods.map((m) => [m.ap, m.interval])") == [[0.8, [0.7, 0.9]], [None, None]]
     page.session = first

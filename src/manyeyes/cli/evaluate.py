@@ -65,6 +65,7 @@ def _evaluate(options: Options) -> None:
     from manyeyes.studies.sensor_notes import print_sensor_note
     from manyeyes.studies.thresholds import load_thresholds
     from manyeyes.viz.progress import track
+    from manyeyes.viz.report import HtmlReport, save_report
     from manyeyes.viz.results import format_comparison_markdown, print_comparison, summarize_comparison
 
     console = Console()
@@ -103,8 +104,20 @@ def _evaluate(options: Options) -> None:
     text = f"{title}\n\n{format_comparison_markdown(comparison)}"
     atomic_write_text(options.out / "results.md", f"{text}\n{note}\n" if note else text)
     path = options.out / "results.json"
-    provenance.write_json(path, comparison, {"options": options, "benchmark": config}, options.seed)
-    console.print(f"\nNumbers, configuration and versions are in {path}", highlight=False, soft_wrap=True)
+    origin = provenance.write_json(path, comparison, {"options": options, "benchmark": config}, options.seed)
+    report_path = options.out / "report.html"
+    page = HtmlReport(
+        title,
+        "All methods on the same scenarios; intervals are over scenarios.",
+        comparison.rows,
+        comparison.differences if comparison.has_several_scenarios else (),
+        notes=tuple(words for words in (comparison.footer, note) if words),
+        provenance=origin,
+    )
+    save_report(page, report_path)
+    console.print(
+        f"\nNumbers, configuration and versions are in {path}; open {report_path}", highlight=False, soft_wrap=True
+    )
 
 
 def _add_times(

@@ -17,6 +17,7 @@ from typing import Any
 
 from manyeyes._io import atomic_write_text
 from manyeyes.datatypes import ConfigError
+from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.evaluation.statistics.comparison import Comparison
 from manyeyes.viz.report_columns import COLUMN_DESCRIPTIONS
 from manyeyes.viz.scene_player import ScenePlayer, to_json
@@ -136,7 +137,7 @@ def _page_data(report: HtmlReport) -> dict[str, Any]:
         {
             "label": name,
             "ap": _number(row.ap50.value) if row.ap50 else None,
-            "interval": [row.ap50.low, row.ap50.high] if row.ap50 and row.ap50.num_scenarios > 1 else None,
+            "interval": _bounds(row.ap50),
             "bytes": _number(row.bytes_per_message),
             "share": _number(row.share_ms) if row.bytes_per_message else None,
             "air": _number(air_ms.get(name)),
@@ -145,6 +146,13 @@ def _page_data(report: HtmlReport) -> dict[str, Any]:
         for name, row in reversed(rows.items())
     ]
     return {"methods": methods, "player": None if player is None else to_json(player), "shown": report.shown}
+
+
+def _bounds(value: Interval | None) -> list[float] | None:
+    """Return the bounds of an interval over several scenarios, where it has any."""
+    if value is None or value.num_scenarios < 2 or not math.isfinite(value.low + value.high):
+        return None
+    return [round(value.low, 4), round(value.high, 4)]
 
 
 def _number(value: float | None) -> float | None:

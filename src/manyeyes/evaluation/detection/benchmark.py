@@ -173,7 +173,7 @@ def run_benchmarks(
     """Yield the tallies of each configuration in turn, as soon as they are there.
 
     open_recording must be picklable when workers > 1; results do not depend on workers. progress counts scenarios played by
-    a configuration.
+    a configuration, from none on.
     """
     recording, groups = open_recording(), _group_configs(configs)
     jobs = [(group, name) for group in groups for name in group[0].filter_recording(recording).scenarios]
@@ -182,6 +182,7 @@ def run_benchmarks(
     def report(done: int) -> None:
         progress(done, total)
 
+    report(0)
     if workers == 1:
         yield from _gather(map(work, jobs), groups, jobs, report)
         return
