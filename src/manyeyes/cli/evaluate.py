@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from manyeyes._bounds import AngleDeg, LengthM, NonNegativeInt, OutputFolder
 from manyeyes.studies.options import EvaluationOptions
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from manyeyes.datasets.base import Recording
     from manyeyes.evaluation.detection.accumulator import MethodResult
     from manyeyes.models.detector.protocols import BoxDetector
+    from manyeyes.viz.results import MethodComparison
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +66,6 @@ def _evaluate(options: Options) -> None:
     from manyeyes.studies.sensor_notes import print_sensor_note
     from manyeyes.studies.thresholds import load_thresholds
     from manyeyes.viz.progress import track
-    from manyeyes.viz.report import HtmlReport, save_report
     from manyeyes.viz.results import format_comparison_markdown, print_comparison, summarize_comparison
 
     console = Console()
@@ -105,7 +105,16 @@ def _evaluate(options: Options) -> None:
     atomic_write_text(options.out / "results.md", f"{text}\n{note}\n" if note else text)
     path = options.out / "results.json"
     origin = provenance.write_json(path, comparison, {"options": options, "benchmark": config}, options.seed)
-    report_path = options.out / "report.html"
+    report_path = _save_page(options.out, title, comparison, note, origin)
+    console.print(
+        f"\nNumbers, configuration and versions are in {path}; open {report_path}", highlight=False, soft_wrap=True
+    )
+
+
+def _save_page(out: Path, title: str, comparison: MethodComparison, note: str, origin: dict[str, Any]) -> Path:
+    """Write the report of an evaluation; returns its path."""
+    from manyeyes.viz.report import HtmlReport, save_report
+
     page = HtmlReport(
         title,
         "All methods on the same scenarios; intervals are over scenarios.",
@@ -114,10 +123,8 @@ def _evaluate(options: Options) -> None:
         notes=tuple(words for words in (comparison.footer, note) if words),
         provenance=origin,
     )
-    save_report(page, report_path)
-    console.print(
-        f"\nNumbers, configuration and versions are in {path}; open {report_path}", highlight=False, soft_wrap=True
-    )
+    save_report(page, out / "report.html")
+    return out / "report.html"
 
 
 def _add_times(

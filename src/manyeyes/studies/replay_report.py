@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 REPORT = "report.html"
-WIDTH, FILM_WIDTH, FILM_FRAME_MS, MAX_FILM_IMAGES = 1280, 800, 200, 25
+WIDTH, FILM_WIDTH, FILM_FRAME_MS, MAX_FILM_IMAGES = 1280, 800, 200, 17
 TITLES = {
     "no-fusion": "No fusion",
     "no-fusion-temporal": "No fusion, with the last two frames",
@@ -94,10 +94,7 @@ class _Film:
 def replay_and_report(drive: Excerpt, detector: BoxDetector, spec: ReportSpec, console: Console) -> HtmlReport:
     """Play the drive and write everything under showing.out; the report as it was saved, to which chapters can be added."""
     eval_indices = drive.eval_indices(drive.scenario)
-    pictured_index = eval_indices[len(eval_indices) // 2] if spec.frame is None else spec.frame
-    if pictured_index not in eval_indices:
-        valid_range = f"{eval_indices.start} to {eval_indices[-1]}"
-        raise ConfigError(f"Frame {pictured_index} of {drive.scenario} is not evaluated; choose one of {valid_range}.")
+    pictured_index = _find_pictured_index(eval_indices, drive.scenario, spec.frame)
     grid, protocol = detector.detection_range, make_own_protocol(detector)
     min_scores = {name: find_min_score(detector, name, spec.min_score) for name in spec.methods}
     metrics = {name: MetricAccumulator(name, protocol) for name in spec.methods}
@@ -130,15 +127,6 @@ def replay_and_report(drive: Excerpt, detector: BoxDetector, spec: ReportSpec, c
     pictures = _save_pictures(pictured_steps, comparison, grid, spec.out, min_scores)
     player, shown = recorder.finish(pictured_index), _select_shown(spec.methods)
     help_chapter = make_help_chapter(player, shown)
-    config = {
-        "spec": spec,
-        "detector": detector.config if isinstance(detector, Detector) else type(detector).__qualname__,
-    }
-    origin = provenance.write_json(spec.out / "results.json", comparison, config, spec.replay.seed)
-    atomic_write_text(
-        spec.out / "results.md",
-        format_markdown(comparison.rows) + (f"\n{comparison.footer}\n" if comparison.footer else ""),
-    )
     report = HtmlReport(
         title=spec.title,
         lead=spec.lead,
@@ -151,10 +139,33 @@ def replay_and_report(drive: Excerpt, detector: BoxDetector, spec: ReportSpec, c
         story=() if help_chapter is None else (help_chapter,),
         shown=shown,
         chapters=(*pose_chapters, reliability_chapter),
-        provenance=origin,
+        provenance=_write_results(comparison, detector, spec),
     )
     save_report(report, spec.out / REPORT)
     return report
+
+
+def _find_pictured_index(eval_indices: range, scenario: str, frame: int | None) -> int:
+    """Return the index of the pictured frame: the chosen one, else the middle one."""
+    index = eval_indices[len(eval_indices) // 2] if frame is None else frame
+    if index not in eval_indices:
+        valid_range = f"{eval_indices.start} to {eval_indices[-1]}"
+        raise ConfigError(f"Frame {index} of {scenario} is not evaluated; choose one of {valid_range}.")
+    return index
+
+
+def _write_results(comparison: MethodComparison, detector: BoxDetector, spec: ReportSpec) -> dict[str, Any]:
+    """Write results.json and results.md; returns where they come from."""
+    config = {
+        "spec": spec,
+        "detector": detector.config if isinstance(detector, Detector) else type(detector).__qualname__,
+    }
+    origin = provenance.write_json(spec.out / "results.json", comparison, config, spec.replay.seed)
+    atomic_write_text(
+        spec.out / "results.md",
+        format_markdown(comparison.rows) + (f"\n{comparison.footer}\n" if comparison.footer else ""),
+    )
+    return origin
 
 
 def _make_pose_chapters(pose_summaries: Mapping[str, PoseCorrectionSummary]) -> tuple[Chapter, ...]:
