@@ -105,10 +105,8 @@ def _evaluate(options: Options) -> None:
     atomic_write_text(options.out / "results.md", f"{text}\n{note}\n" if note else text)
     path = options.out / "results.json"
     origin = provenance.write_json(path, comparison, {"options": options, "benchmark": config}, options.seed)
-    report_path = _save_page(options.out, title, comparison, note, origin)
-    console.print(
-        f"\nNumbers, configuration and versions are in {path}; open {report_path}", highlight=False, soft_wrap=True
-    )
+    page = _save_page(options.out, title, comparison, note, origin)
+    console.print(f"\nNumbers, configuration and versions are in {path}; open {page}", highlight=False, soft_wrap=True)
 
 
 def _save_page(out: Path, title: str, comparison: MethodComparison, note: str, origin: dict[str, Any]) -> Path:
