@@ -28,6 +28,7 @@ from manyeyes.viz.report import Chapter, ReportImage
 
 Floats = NDArray[np.float64]
 PLACE, NUM_OBSERVATIONS, SIZE_M, MAX_PAIR_DISTANCE_M = "cross", 60, 160.0, 15.0
+MAX_PAIRED = 30
 HEADINGS = ("map", "mAP", "precision", "F1", "duplication")
 
 
@@ -128,10 +129,11 @@ def _make_pair_panels(experiment: FleetExperiment, solution: PoseSolution) -> li
 
 
 def _find_largest_difference(observations: tuple[Observation, ...]) -> tuple[Observation, Observation]:
-    """Of different agents, at most 15 m apart: the pair with the longest arrows in sum."""
+    """Of the first MAX_PAIRED observations, of different agents, at most 15 m apart: the pair with the longest arrows in sum."""
     best, pair = -1.0, (observations[0], observations[-1])
-    for i, one in enumerate(observations):
-        for two in observations[i + 1 :]:
+    candidates = observations[:MAX_PAIRED]
+    for i, one in enumerate(candidates):
+        for two in candidates[i + 1 :]:
             if one.agent != two.agent and np.hypot(*(one.pose - two.pose)[:2]) <= MAX_PAIR_DISTANCE_M:
                 arrows = compute_misalignment(two.elements_in_map(), one.elements_in_map())
                 total = float(np.hypot(arrows[:, 2], arrows[:, 3]).sum())

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 REPORT = "report.html"
-WIDTH, FILM_WIDTH, FILM_FRAME_MS, MAX_FILM_IMAGES = 1280, 800, 200, 17
+WIDTH, FILM_WIDTH, FILM_FRAME_MS, MAX_FILM_IMAGES = 1280, 800, 200, 13
 TITLES = {
     "no-fusion": "No fusion",
     "no-fusion-temporal": "No fusion, with the last two frames",
