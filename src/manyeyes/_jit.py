@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
 from filelock import FileLock
@@ -48,6 +48,9 @@ __all__ = [
     "njit",
     "set_row",
 ]
+
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 class _LockedIndexFile(caching.IndexDataCacheFile):
@@ -134,17 +137,17 @@ class _Loop(CPUDispatcher):
         return super().is_compiling or self._linked.is_compiling
 
 
-def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+def njit(*, cache: bool = False, **options: Any) -> Callable[[_Function], _Function]:
     """Return numba's decorator of the same name, for functions without signatures; options: its other options.
 
     A loop is compiled at its first call, for the types of the arguments; cache: keep it on disk.
     """
 
-    def decorate(function: Callable[..., Any]) -> Any:
+    def decorate(function: _Function) -> _Function:
         loop = _Loop(function, targetoptions={"nopython": True, "boundscheck": None, **options})
         if cache:
             loop.enable_caching()
-        return loop
+        return cast(_Function, loop)
 
     return decorate
 

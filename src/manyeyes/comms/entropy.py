@@ -402,7 +402,7 @@ def _inverse(frequency: np.uint64) -> np.uint64:  # pragma: no cover
 
 
 @njit(cache=True)
-def _take(state: Int64, frequency: int, offset: Int64, raw: U8x1, at: int) -> tuple[Int64, int]:  # pragma: no cover
+def _take(state: Int64, frequency: Int64, offset: Int64, raw: U8x1, at: int) -> tuple[Int64, int]:  # pragma: no cover
     """State and place after a symbol; offset: how far the state lies above the symbol's start. Bytes beyond the end are 0."""
     state = frequency * (state >> TOTAL_BITS) + offset
     while state < _MIN_STATE and at <= raw.shape[0]:

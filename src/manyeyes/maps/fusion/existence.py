@@ -621,7 +621,7 @@ def update_existence(
         hit = params.trusted_hit if trusted[o] else params.hit
         change = hit * score_weight[o] if is_hit else params.miss * seen
         if not trusted[o]:
-            change = _bound_daily_change(scratch, a, change, params.max_daily_change)
+            change = _bound_daily_change(scratch, a, float(change), params.max_daily_change)
         floor = -max_log_odds if is_hit else floor
         odds = min(max_log_odds, max(floor, odds + change))
         if is_hit:
