@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import manyeyes
-from manyeyes._jit import _LockedIndexFile, njit, set_row
+from manyeyes._jit import _LockedIndexFile, add_row, njit, set_row, set_rows
 
 
 class _Slow(_LockedIndexFile):
@@ -143,10 +143,14 @@ def test_a_later_process_takes_the_whole_loop_from_the_disk(tmp_path: Path) -> N
     assert not [path.name for path in tmp_path.rglob("*.nbc") if "inner" in path.name]
 
 
-def test_a_row_is_set() -> None:
+def test_rows_are_set_and_added() -> None:
     out = np.zeros((2, 3), np.float32)
     set_row(out[1], np.array([1.0, 2.0, 3.0], np.float32))
     assert out.tolist() == [[0, 0, 0], [1, 2, 3]]
+    add_row(out[1], np.array([0.5, 0.5, 0.5], np.float32))
+    assert out.tolist() == [[0, 0, 0], [1.5, 2.5, 3.5]]
+    set_rows(out, np.arange(6.0, dtype=np.float32).reshape(2, 3))
+    assert out.tolist() == [[0, 1, 2], [3, 4, 5]]
 
 
 def test_every_loop_takes_njit_from_here() -> None:

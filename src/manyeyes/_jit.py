@@ -45,8 +45,10 @@ __all__ = [
     "U8x1",
     "U8x2",
     "Uintpx1",
+    "add_row",
     "njit",
     "set_row",
+    "set_rows",
 ]
 
 
@@ -185,3 +187,18 @@ def set_row(out: Any, values: Any) -> None:  # pragma: no cover
     """
     for i in range(out.shape[0]):
         out[i] = values[i]
+
+
+@njit(cache=True, nogil=True)
+def set_rows(out: Any, values: Any) -> None:  # pragma: no cover
+    """out (M, N) = values (M, N), as ``set_row`` does."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = values[i, j]
+
+
+@njit(cache=True, nogil=True)
+def add_row(out: Any, values: Any) -> None:  # pragma: no cover
+    """out (N,) += the first N of values, as ``set_row`` does."""
+    for i in range(out.shape[0]):
+        out[i] += values[i]

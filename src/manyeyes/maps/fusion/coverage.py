@@ -135,7 +135,7 @@ def _merge_runs(runs: I64x2) -> I64x2:  # pragma: no cover - compiled
             out[n, 2] = max(out[n, 2], runs[k, 2])
         else:
             n += 1
-            out[n] = runs[k]
+            set_row(out[n], runs[k])
     return out[: n + 1].copy()
 
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, njit, set_row
+from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, add_row, njit, set_row
 from manyeyes.datatypes.map_element import CROSSING
 from manyeyes.maps.fusion.existence import (
     MATCHED,
@@ -229,7 +229,7 @@ def _half_plane(ring: F64x2, px: float, py: float, nx: float, ny: float) -> F64x
         da = (a[0] - px) * nx + (a[1] - py) * ny
         db = (b[0] - px) * nx + (b[1] - py) * ny
         if da <= 0.0:
-            out[n] = a
+            set_row(out[n], a)
             n += 1
         if (da < 0.0 < db) or (db < 0.0 < da):
             t = da / (da - db)
@@ -427,7 +427,8 @@ def _places_in(ring: F64x2) -> F64x2:  # pragma: no cover - compiled
     places = np.empty((1 + len(ring), 2))
     places[0, 0], places[0, 1] = ring[:, 0].mean(), ring[:, 1].mean()
     for i in range(len(ring)):
-        places[1 + i] = 0.5 * (places[0] + ring[i])
+        for axis in range(2):
+            places[1 + i, axis] = 0.5 * (places[0, axis] + ring[i, axis])
     return places
 
 
@@ -466,7 +467,7 @@ def _accumulate_evidence(
             share = _common(hulls[hull_first[r] : hull_first[r + 1]], ring) / min(area[r], size)
             if share >= min_overlap:
                 if overlap_state[owner[r]] != MATCHED:
-                    out.style[k] += style[rows[r]]
+                    add_row(out.style[k], style[rows[r]])
                     gain[owner[r]] = 0.0
                 gain[owner[r]] = max(gain[owner[r]], score_weight[rows[r]])
                 overlap_state[owner[r]] = MATCHED

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, I64x2, U8x2, njit, set_row
+from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, I64x2, U8x2, add_row, njit, set_row
 from manyeyes.datatypes.map_element import take_rows
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED
 from manyeyes.maps.fusion.observation_arrays import DAY_NS, FieldsOfView, ObservationArrays, compute_visibility, is_line
@@ -479,7 +479,7 @@ def _accumulate_evidence(
                     sources = doubled(sources)
                 sources[filled] = o
                 filled += 1
-                out.style[k] += style[element[o]]
+                add_row(out.style[k], style[element[o]])
                 gain[o] = score_weight[element[o]]
         first[k + 1] = filled
         place[0, 0], place[0, 1] = xy[k, 0] - shift[k] * tangent[k, 1], xy[k, 1] + shift[k] * tangent[k, 0]

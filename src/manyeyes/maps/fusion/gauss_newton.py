@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import Boolx1, F64x1, F64x2, F64x3, I64x1, njit
+from manyeyes._jit import Boolx1, F64x1, F64x2, F64x3, I64x1, njit, set_row, set_rows
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays
 from manyeyes.maps.fusion.point_grid import find_cell_range, line_residual
 
@@ -180,8 +180,8 @@ def _step_all(
         spread = jacobian @ root @ axes
         outward = np.ascontiguousarray(np.linalg.inv(spread).T)
         narrow = (spread / (1.0 + observed_strength)) @ spread.T
-        covariance[h] = (narrow + narrow.T) / 2
-        information_matrix[h] = (outward * observed_strength) @ outward.T
-        observability[h] = np.sort(observed_strength / (1.0 + strength))
-        information_vector[h] = information_matrix[h] @ moved + outward @ pull
+        set_rows(covariance[h], (narrow + narrow.T) / 2)
+        set_rows(information_matrix[h], (outward * observed_strength) @ outward.T)
+        set_row(observability[h], np.sort(observed_strength / (1.0 + strength)))
+        set_row(information_vector[h], information_matrix[h] @ moved + outward @ pull)
     return next_pose, covariance, observability, information_matrix, information_vector

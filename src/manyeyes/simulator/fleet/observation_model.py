@@ -264,8 +264,9 @@ def _emit_false(
         dx, dy = line[-1, 0] - line[0, 0], line[-1, 1] - line[0, 1]
         size_of = max(np.hypot(dx, dy), 1e-9)
         ghost = line.copy()
-        ghost[:, 0] -= offset * dy / size_of
-        ghost[:, 1] += offset * dx / size_of
+        for i in range(len(ghost)):
+            ghost[i, 0] -= offset * dy / size_of
+            ghost[i, 1] += offset * dx / size_of
         return kind, _emit_line(ghost, noise, key, element, run, 2, out)
     x = noise.x_min + (noise.x_max - noise.x_min) * hash_uniform(key, element, run, _PLACE)
     y = noise.y_min + (noise.y_max - noise.y_min) * hash_uniform(key, element, run, _PLACE + 1)
