@@ -118,7 +118,7 @@ class _LinkedCompiler(CompilerBase):
         return [manager]
 
 
-class _Loop(CPUDispatcher):
+class _CompiledLoop(CPUDispatcher):
     """A loop to be called from Python, and its form for callers that are compiled."""
 
     def __init__(
@@ -146,7 +146,7 @@ def njit(*, cache: bool = False, **options: Any) -> Callable[[_Function], _Funct
     """
 
     def decorate(function: _Function) -> _Function:
-        loop = _Loop(function, targetoptions={"nopython": True, "boundscheck": None, **options})
+        loop = _CompiledLoop(function, targetoptions={"nopython": True, "boundscheck": None, **options})
         if cache:
             loop.enable_caching()
         return cast(_Function, loop)
