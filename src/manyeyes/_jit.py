@@ -101,7 +101,7 @@ class _LinkedLowering(NativeLowering):
         state.library = _LinkedLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
         state.flags.no_compile = True
         super().run_pass(state)
-        # Callers find the loop by its entry point, of which numba wants a builtin; this one is never called.
+        # Callers find the loop by its entry point, which must be a builtin; this one is never called.
         entry_point = object().__reduce__
         state.targetctx.insert_user_function(entry_point, state["cr"].fndesc, [state.library])
         state["cr"] = state["cr"]._replace(cfunc=entry_point)

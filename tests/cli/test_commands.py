@@ -191,7 +191,7 @@ def test_an_unknown_scenario_or_frame_lists_the_known(data, weights, tmp_path, c
     assert run(*common, "--frame", 0) == 1
     assert "1 to 2" in capsys.readouterr().err
     assert run("view", data, "--split", "test", "--frame", 99, "--out", tmp_path / "x.png") == 1
-    assert "from 0 to 2" in capsys.readouterr().err
+    assert "has no frame 99; choose one of 0 to 2." in capsys.readouterr().err
 
 
 def test_weights_of_another_shape_are_one_line(data, weights, tmp_path, capsys) -> None:

@@ -118,6 +118,7 @@ CASES = [
     ("keys revoke c", "cryptography", "keys revoke needs the 'live' extra"),
     ("keys trust t", "cryptography", "keys trust needs the 'live' extra"),
     ("keys demo", "cryptography", "keys demo needs the 'live' extra"),
+    ("report docs", "matplotlib", "report docs needs the 'view' extra"),
     ("study robustness --data d", "matplotlib", "study robustness needs the 'view' extra"),
     ("study qualitative --data d", "PIL", "study qualitative needs the 'view' extra"),
     (

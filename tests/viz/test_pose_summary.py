@@ -58,4 +58,4 @@ def test_the_report_shows_the_table() -> None:
     summary.add(3, [make_outcome(-1, MessageUse.CORRECTED, PoseHealth.OFFSET)])
     chapter = report.Chapter("Who is where", "Text.", table=(HEADINGS, *summary.make_rows()))
     page = report.render(report.HtmlReport("A drive", "Lead.", chapters=(chapter,)))
-    assert "<th>prior pose</th>" in page and "<td>offset</td>" in page and "-1 (roadside unit)" in page
+    assert "<th>prior pose<small>" in page and "<td>offset</td>" in page and "-1 (roadside unit)" in page

@@ -19,7 +19,7 @@ import rerun
 from manyeyes.datatypes import Boxes, ConfigError, Transform
 from manyeyes.viz.rerun_log import RerunLog
 from manyeyes.viz.rerun_server import RerunServer
-from manyeyes.viz.spatial_entities import LINK_HEIGHT_M, MAX_POINTS, shade_by_intensity
+from manyeyes.viz.spatial_entities import LINK_HEIGHT_M, MAX_POINTS, AgentGroup, SpatialDescription, shade_by_intensity
 from manyeyes.viz.spatial_frame import (
     BOX_COLORS,
     ShownAgent,
@@ -122,6 +122,43 @@ def test_long_clouds_are_thinned_and_a_failed_log_leaves_no_file(tmp_path: Path)
     assert [p.name for p in tmp_path.iterdir()] == ["a.rrd"]
     with pytest.raises(ConfigError, match=r"\.rrd"):
         RerunLog("drive.png")
+
+
+def test_a_file_that_could_not_be_written_whole_replaces_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "drive.rrd"
+    path.write_bytes(b"the drive of yesterday")
+
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError("no space left")
+
+    problem = r"drive\.rrd: not all frames could be written \(no space left\)"
+    with pytest.raises(ConfigError, match=problem), RerunLog(str(path), "drive") as log:
+        log.add(make_frame())
+        monkeypatch.setattr(rerun.RecordingStream, "flush", fail)
+    assert path.read_bytes() == b"the drive of yesterday" and [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_an_end_after_a_flush_needs_the_viewer_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError("the viewer is gone")
+
+    with RerunLog(str(tmp_path / "drive.rrd"), "drive") as log:
+        log.add(make_frame())
+        log.flush()
+        monkeypatch.setattr(rerun.RecordingStream, "flush", fail)
+    assert (tmp_path / "drive.rrd").stat().st_size > 0
+
+
+def test_an_agent_keeps_its_colour_where_another_is_gone() -> None:
+    description = SpatialDescription()
+    both = make_frame()
+    (first, second), (left,) = (
+        next(group for group in description.describe(frame) if isinstance(group, AgentGroup)).items
+        for frame in (both, replace(both, agents=both.agents[1:]))
+    )
+    assert first.color != second.color and left.color == second.color
 
 
 def test_what_an_instant_no_longer_has_is_cleared(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import base64
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -94,6 +95,14 @@ def test_returns_are_counted_in_turned_boxes() -> None:
     assert count_returns(turned, [cloud, cloud[:0]]).tolist() == [[1, 0], [1, 0], [0, 0]]
     inside = turned[:1].contains(torch.from_numpy(cloud), 0.1)
     assert count_returns(turned[:1], [cloud]).tolist() == [[int(inside.sum())]]
+
+
+def test_points_on_the_road_are_no_returns_and_those_of_a_vehicle_downhill_are() -> None:
+    cloud = np.array([[10.0, 5.0, 0.2], [10.0, 5.0, 0.5], [10.0, 5.0, -1.8], [10.0, 5.0, -1.5]])
+    car = boxes((10.0, 5.0, 0.0))
+    downhill = replace(car, center=car.center - torch.tensor([0.0, 0.0, 2.0]))
+    assert count_returns(car, [cloud]).tolist() == [[1]]
+    assert count_returns(downhill, [cloud]).tolist() == [[1]]
 
 
 def test_boxes_are_integers_and_points_are_thinned_to_their_limit(monkeypatch) -> None:

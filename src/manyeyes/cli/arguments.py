@@ -14,7 +14,7 @@ import tyro
 from manyeyes.cli.bounds import find_violation
 
 PARSER_CONFIG = (tyro.conf.OmitArgPrefixes,)
-"""Settings of every parser. A flag is a pair, --animate and --no-animate: help and default both speak of what is on."""
+"""Settings of every parser. A flag is a pair, --animate and --no-animate: help and default are those of the flag that is on."""
 _COLOUR = re.compile("\x1b\\[[0-9;]*m")
 _FRAME = re.compile("[│╭╮╰╯]|[─-]{3,}")
 """What tyro draws around an error: sides of a box, and rules, of hyphens where the encoding is not UTF-8."""

@@ -146,17 +146,19 @@ def _log_drive(options: Options) -> None:
         raise ConfigError(f"--mcap {options.mcap} is the recording itself; choose another file.")
     frames, total = _open_frames(options, console)
     with ExitStack() as files:
-        logs, notes, viewer = list[SpatialLog](), list[str](), None
-        if options.mcap is not None:
-            logs.append(files.enter_context(FoxgloveLog(options.mcap, options.cloud_color)))
-            notes.append(f"{options.mcap}: {{}} frames; open it with Foxglove")
+        logs, openings, viewer = list[SpatialLog](), list[tuple[str, str]](), None
         if options.rerun is not None:
             viewer = files.enter_context(RerunLog(options.rerun, options.recording.name, options.cloud_color))
             logs.append(viewer)
-            notes.append(f"{options.rerun}: {{}} frames; " + _describe_opening(options.rerun))
+            openings.append((options.rerun, _describe_opening(options.rerun)))
+        # Finished first: a viewer that has gone does not spoil the file.
+        if options.mcap is not None:
+            logs.append(files.enter_context(FoxgloveLog(options.mcap, options.cloud_color)))
+            openings.append((str(options.mcap), "open it with Foxglove"))
         if viewer is not None and viewer.server is not None:
-            for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, signal.default_int_handler)
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                before = signal.signal(number, signal.default_int_handler)
+                files.callback(signal.signal, number, before)
             console.print(f"Open {viewer.server.page}", highlight=False, soft_wrap=True)
         with make_progress_bars(console) as progress:
             task = progress.add_task("Logging", total=total)
@@ -166,8 +168,8 @@ def _log_drive(options: Options) -> None:
             with suppress(KeyboardInterrupt):
                 console.print("All frames are logged; Ctrl-C ends the viewer", highlight=False, soft_wrap=True)
                 viewer.server.wait()
-    for note in notes:
-        console.print(note.format(num), highlight=False, soft_wrap=True)
+    for target, opening in openings:
+        console.print(f"{target}: {num} frames; {opening}", highlight=False, soft_wrap=True, markup=False)
 
 
 def _describe_opening(target: str) -> str:
@@ -186,9 +188,11 @@ def _open_frames(options: Options, console: Console) -> tuple[Iterator[SpatialFr
     from manyeyes.studies.spatial_views import show_run
 
     if options.recording.suffix == ".mcap" and options.recording.is_file():
-        if options.map is not None or options.detect is not None:
+        given = [name for name in ("detect", "map", "frame", "scenario", "split") if getattr(options, name) is not None]
+        if given:
             raise ConfigError(
-                "A recorded live run has detections and local maps of its own: leave out --detect and --map."
+                "A recorded live run is one drive, with detections and local maps of its own, shown from its start: leave out "
+                f"{', '.join(f'--{name}' for name in given)}."
             )
         torch.set_num_threads(read_config(options.recording).num_threads)
         total = count_ticks(options.recording)

@@ -105,7 +105,7 @@ def draw_point(
 ) -> None:
     """Add a point with the interval of its y value; hollow: an open marker."""
     value = interval["value"]
-    errors = [[value - interval["low"]], [interval["high"] - value]]
+    errors = [[max(0.0, value - interval["low"])], [max(0.0, interval["high"] - value)]]
     axes.errorbar(
         [x], [value], errors, color=colour, marker="o", ms=6, mfc="none" if hollow else colour, mew=1.5, capsize=2.5,
         ls="none", label=label,

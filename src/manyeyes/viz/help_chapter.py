@@ -85,6 +85,6 @@ def _describe(
     return (
         f"Counted in pairs of a vehicle and a frame, of which there are {total:,}: {alone.name} finds {num_alone:,}, {helped.name} "
         f"{num_helped:,}. Of the {total - num_alone:,} that the ego misses alone, {supplied:,} are found with messages; on "
-        f"{unseen:,} of these its LiDAR has no point at all. {lost} A vehicle is supplied by the agent with the most LiDAR "
-        "points on it."
+        f"{unseen:,} of these its LiDAR has no point above the wheels. {lost} A vehicle is supplied by the agent with the most "
+        "LiDAR points on it."
     )

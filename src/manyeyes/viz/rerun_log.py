@@ -65,6 +65,7 @@ class RerunLog:
         self._rerun = import_extra("rerun", "rerun", "Logging for the viewer")
         self._description, self._shown = SpatialDescription(cloud_color), dict[str, set[str]]()
         self._has_layout, self._colored = False, set[str]()
+        self._target, self._is_file, self._is_pending = target, is_file, True
         self.server: RerunServer | None = None
         with ExitStack() as resources:
             self._stream: Any = self._rerun.RecordingStream("manyeyes")
@@ -88,24 +89,35 @@ class RerunLog:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            self.flush()
-        finally:
+            if error is None and self._is_pending:
+                self.flush()
+        except BaseException as failure:
+            # A file that is not whole must not get its name.
             self._stream.disconnect()
-            self._resources.__exit__(kind, error, trace)
+            self._resources.__exit__(type(failure), failure, failure.__traceback__)
+            raise
+        self._stream.disconnect()
+        self._resources.__exit__(kind, error, trace)
 
     def flush(self) -> None:
         """Wait until all that was logged is written, or was received by the viewer.
 
         Raises:
-            ConfigError: the viewer no longer answers.
+            ConfigError: the file cannot be written, or the viewer no longer answers.
         """
         try:
             self._stream.flush(timeout_sec=_FLUSH_S)
         except RuntimeError as error:
-            raise ConfigError(f"The viewer did not take all frames ({error}); start it again, and repeat.") from error
+            if self._is_file:
+                text = f"{self._target}: not all frames could be written ({error}); free space on its disk, and repeat."
+            else:
+                text = f"The viewer did not take all frames ({error}); start it again, and repeat."
+            raise ConfigError(text) from error
+        self._is_pending = False
 
     def add(self, frame: SpatialFrame) -> None:
         """Log the frame of one instant."""
+        self._is_pending = True
         stream = self._stream
         if not self._has_layout and frame.agents:
             stream.send_blueprint(_make_layout(frame.agents[0]))

@@ -61,7 +61,7 @@ class PlayerFrame:
 
 @dataclass(frozen=True)
 class PlayerDetections:
-    """Detections of one method at one instant, by falling score, as they are evaluated at IoU 0.5.
+    """Detections of one method at one instant, class by class, by falling score in each, as they are evaluated at IoU 0.5.
 
     truth_row: (D,) int64, the true box that each one matches, -1 for none. num_returns: (D, A) as those of true boxes. received:
     ids of the agents whose messages were fused. num_bytes: of all messages that were sent to the ego at this instant.

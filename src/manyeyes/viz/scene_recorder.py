@@ -89,7 +89,7 @@ class SceneRecorder:
             PlayerMethod(
                 name,
                 self.titles.get(name, name),
-                self.min_scores[name],
+                max(MIN_SCORE, self.min_scores[name]),
                 get_strategy(name).waits_for_messages,
                 tuple(self.detections[name, index] for index in indices),
                 float(np.mean(self.air_ms[name])) if self.air_ms.get(name) else None,
@@ -100,18 +100,17 @@ class SceneRecorder:
         return ScenePlayer(self.view, period_s, tuple(frames), methods, first, len(self.indices) - len(indices))
 
     def _make_frame(self, snapshot: Snapshot, ego: int) -> PlayerFrame:
-        """Return agents, ego first, and true boxes of an instant; keeps the clouds above the road for its methods."""
+        """Return agents, ego first, and true boxes of an instant; keeps the clouds for its methods."""
         scene = make_scene(snapshot, Boxes.empty(), ego)
         order = sorted(range(len(scene.agents)), key=lambda row: row != ego)
         clouds, agents = [], []
         for row in order:
             agent = scene.agents[row]
             xyz = agent.cloud.xyz.double().numpy()
-            xyz = xyz[xyz[:, 2] > MAX_GROUND_HEIGHT_M]
             clouds.append(xyz)
             x, y = agent.ego_from_agent.translation[:2].tolist()
             yaw = float(agent.ego_from_agent.yaw)
-            cells = find_cells(xyz[:, :2], self.view)
+            cells = find_cells(xyz[xyz[:, 2] > MAX_GROUND_HEIGHT_M, :2], self.view)
             agents.append(PlayerAgent(agent.agent_id, agent.name, agent.is_infrastructure, x, y, yaw, cells))
         self._clouds = clouds
         truth = Boxes.empty(torch.float64) if snapshot.truth is None else select_ego_truth(snapshot, ego, self.protocol)
@@ -138,7 +137,10 @@ def match_detections(step: ReplayStep, truth: Boxes, protocol: DetectionProtocol
 
 
 def count_returns(boxes: Boxes, clouds: Sequence[Floats]) -> Ints:
-    """Return (N, A) int64: the points of each cloud (P, 3) inside each box, which is enlarged by BOX_MARGIN_M."""
+    """Return (N, A) int64: the points of each cloud (P, 3) inside each box, which is enlarged by BOX_MARGIN_M.
+
+    Points up to MAX_GROUND_HEIGHT_M above the bottom of a box are left out: they may lie on the road.
+    """
     counts = np.zeros((len(boxes), len(clouds)), dtype=np.int64)
     points = np.concatenate([np.zeros((0, 3)), *clouds])
     agent = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
@@ -152,6 +154,7 @@ def count_returns(boxes: Boxes, clouds: Sequence[Floats]) -> Ints:
         near = low + np.flatnonzero(np.abs(points[low:high, 1] - centre[1]) <= reach)
         offset = points[near] - centre
         forward, left = offset[:, 0] * c + offset[:, 1] * s, offset[:, 1] * c - offset[:, 0] * s
-        inside = (np.abs(forward) <= half[0]) & (np.abs(left) <= half[1]) & (np.abs(offset[:, 2]) <= half[2])
+        inside = (np.abs(forward) <= half[0]) & (np.abs(left) <= half[1]) & (offset[:, 2] <= half[2])
+        inside &= offset[:, 2] > MAX_GROUND_HEIGHT_M - size[2] / 2
         counts[row] = np.bincount(agent[near[inside]], minlength=len(clouds))
     return counts

@@ -52,7 +52,7 @@ MAP_COLORS: Mapping[str, Rgb] = {
 }
 """Colours of map elements by kind."""
 _GROUPS_WITHOUT_LABELS = frozenset({"truth", "map"})
-"""Groups whose labels a viewer shows for a chosen item alone: their colours say what they are."""
+"""Groups whose labels a viewer shows for a chosen item alone: their colours tell them apart."""
 _OTHER_MAP_COLOR: Rgb = (200, 200, 90)
 _LATE_COLOR, _LINK_COLOR, _CORRECTION_COLOR, _POSE_ERROR_COLOR = (
     (120, 120, 120),
@@ -161,10 +161,11 @@ class SpatialDescription:
         self.cloud_color: CloudColor = cloud_color
         self._map: Mapping[str, tuple[Floats, ...]] = {}
         self._filled = set[str]()
+        self._rows = dict[int, int]()
 
     def describe(self, frame: SpatialFrame) -> Iterator[Entity]:
         """Yield the entities of one instant. Each replaces its group: lines that are gone are yielded as a group without items."""
-        yield AgentGroup(tuple(self._make_agent(number, agent) for number, agent in enumerate(frame.agents)))
+        yield AgentGroup(tuple(self._make_agent(agent) for agent in frame.agents))
         corrected = [(agent, agent.corrected) for agent in frame.agents if agent.corrected is not None]
         true_poses = [(agent, agent.true_pose) for agent in frame.agents if agent.true_pose is not None]
         yield from self._make_lines("corrections", [_make_arrow(*pair, _CORRECTION_COLOR) for pair in corrected], True)
@@ -179,7 +180,7 @@ class SpatialDescription:
             yield from self._make_lines("map", kinds)
         self._map = frame.map_lines
         if frame.numbers:
-            yield NumberGroup(frame.numbers, _color_numbers(frame))
+            yield NumberGroup(frame.numbers, self._color_numbers(frame))
         if frame.events:
             yield TextGroup(frame.events)
 
@@ -189,8 +190,12 @@ class SpatialDescription:
             self._filled.add(group)
             yield LineGroup(group, tuple(items), are_arrows)
 
-    def _make_agent(self, number: int, agent: ShownAgent) -> LoggedAgent:
-        color = _agent_color(number)
+    def _color_of(self, agent_id: int) -> Rgb:
+        """Return the colour of an agent, which it keeps where others come and go."""
+        return AGENT_COLORS[self._rows.setdefault(agent_id, len(self._rows)) % len(AGENT_COLORS)]
+
+    def _make_agent(self, agent: ShownAgent) -> LoggedAgent:
+        color = self._color_of(agent.agent_id)
         cloud = None
         if agent.points is not None:
             step = max(1, -(-len(agent.points) // MAX_POINTS))
@@ -200,17 +205,12 @@ class SpatialDescription:
             cloud = LoggedCloud(points, intensity, shades)
         return LoggedAgent(str(agent.agent_id), agent.world_from_agent, color, cloud)
 
-
-def _color_numbers(frame: SpatialFrame) -> dict[str, Rgb]:
-    """Return the colours of the paths whose last part is an agent's id, or a kind of boxes."""
-    colors: dict[str, Rgb] = {str(agent.agent_id): _agent_color(row) for row, agent in enumerate(frame.agents)}
-    colors |= BOX_COLORS
-    names = {path: path.rpartition("/")[2] for path in frame.numbers}
-    return {path: colors[name] for path, name in names.items() if name in colors}
-
-
-def _agent_color(row: int) -> Rgb:
-    return AGENT_COLORS[row % len(AGENT_COLORS)]
+    def _color_numbers(self, frame: SpatialFrame) -> dict[str, Rgb]:
+        """Return the colours of the paths whose last part is an agent's id, or a kind of boxes."""
+        colors: dict[str, Rgb] = {str(agent.agent_id): self._color_of(agent.agent_id) for agent in frame.agents}
+        colors |= BOX_COLORS
+        names = {path: path.rpartition("/")[2] for path in frame.numbers}
+        return {path: colors[name] for path, name in names.items() if name in colors}
 
 
 def shade_by_agent(color: Rgb, intensity: NDArray[np.float32]) -> NDArray[np.uint8]:

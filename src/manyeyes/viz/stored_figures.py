@@ -36,7 +36,7 @@ def draw_figure(name: str, results: Sequence[StoredResult], theme: Theme) -> str
     figure = FIGURES[name]
     try:
         return draw_svg(figure.make(results), theme, figure.height_in)
-    except (KeyError, TypeError, IndexError) as error:
+    except (KeyError, TypeError, IndexError, ValueError) as error:
         files = ", ".join(str(stored.path) for stored in results)
         raise ConfigError(
             f"{files}: no result of the figure {name} ({error!r}); it needs one of: {figure.command}."
@@ -47,6 +47,8 @@ def _make_ap_bytes(results: Sequence[StoredResult]) -> list[Panel]:
     rows = [row for stored in results for row in stored.result["rows"]]
     names = list(dict.fromkeys(split_form(row["method"])[0] for row in rows))
     has_two_forms = len({split_form(row["method"])[1] for row in rows}) > 1
+
+    has_level_with_memory = any(split_form(row["method"])[1] for row in rows if not row["bytes_per_message"])
 
     def label_of(method: str) -> str:
         name, has_memory = split_form(method)
@@ -61,7 +63,7 @@ def _make_ap_bytes(results: Sequence[StoredResult]) -> list[Panel]:
                     x = math.log2(row["bytes_per_message"])
                     hollow = has_two_forms and not has_memory
                     draw_point(axes, x, row[field], colour, label_of(row["method"]), hollow=hollow)
-                elif has_memory or not has_two_forms:
+                elif has_memory or not has_level_with_memory:
                     draw_level(axes, row[field], colour, label_of(row["method"]))
 
         return Panel(title, "log2(bytes per message)", title, draw)
@@ -79,8 +81,8 @@ def _make_differences(results: Sequence[StoredResult]) -> list[Panel]:
             chosen = [row for row in rows if row["metric"] == metric]
             x = [row["interval"]["value"] for row in chosen]
             errors = [
-                [row["interval"]["value"] - row["interval"]["low"] for row in chosen],
-                [row["interval"]["high"] - row["interval"]["value"] for row in chosen],
+                [max(0.0, row["interval"]["value"] - row["interval"]["low"]) for row in chosen],
+                [max(0.0, row["interval"]["high"] - row["interval"]["value"]) for row in chosen],
             ]
             y = [names.index(row["description"]) + (0.15 if place == 0 else -0.15) for row in chosen]
             axes.errorbar(
@@ -287,8 +289,8 @@ def _make_attacks(results: Sequence[StoredResult]) -> list[Panel]:
             mine = [row for row in played if row["defence"] == defence]
             values = [row["ap"][0]["value"] for row in mine]
             errors = [
-                [row["ap"][0]["value"] - row["ap"][0]["low"] for row in mine],
-                [row["ap"][0]["high"] - row["ap"][0]["value"] for row in mine],
+                [max(0.0, row["ap"][0]["value"] - row["ap"][0]["low"]) for row in mine],
+                [max(0.0, row["ap"][0]["high"] - row["ap"][0]["value"]) for row in mine],
             ]
             y = [attacks.index(row["attack"]) + 0.22 * ((len(defences) - 1) / 2 - place) for row in mine]
             axes.errorbar(

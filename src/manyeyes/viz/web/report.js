@@ -317,12 +317,12 @@ function drawPlots() {
   drawCurves(byId("plot-false"), 90, "wrong", Math.max(...perFrame.flat().map((r) => r.wrong), 1));
 }
 
-function show() { drawView(); drawPlots(); }
+function show() { drawView(); drawPlots(); showKeys(); }
 
 function select(method) {
   state.method = method;
   [...byId("tabs").children].forEach((tab, row) => tab.setAttribute("aria-selected", String(row === method)));
-  showScore(); count(); showKeys(); show();
+  showScore(); count(); show();
 }
 
 function showScore() {
@@ -463,7 +463,7 @@ function startPlayer() {
 
 function drawAll() {
   if (byId("plot-bytes")) { drawBytes(); showStages(); }
-  if (player && perFrame.length) { showKeys(); show(); }
+  if (player && perFrame.length) show();
 }
 
 if (player) startPlayer();
