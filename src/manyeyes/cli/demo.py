@@ -3,8 +3,8 @@
 
 Three connected vehicles and a roadside unit meet at a crossing with traffic, buildings and occlusion. Detections of no fusion,
 late, intermediate and early fusion, all with the same memory of two frames, are compared on the same channel; --methods selects
-others. The report plays the drive with every method, and shows what the ego alone misses and who supplied it. A map of a crossroads
-is fused too, from the local maps of a simulated fleet.
+others. The report plays the drive with every method, and shows what the ego alone misses and which agent supplied it. A map of a
+crossroads is fused too, from the local maps of a simulated fleet.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ def _run_demo(options: Options) -> None:
     spec = ReportSpec(
         out=options.out,
         title=f"manyeyes demo: one drive, {len(options.replay_options.methods)} methods",
-        lead=f"Three vehicles and a roadside unit in {town}, which the shipped weights never saw: what the ego alone misses, who "
-        "supplies it, and what it costs in bytes and milliseconds. All that passes between agents is bytes.",
+        lead=f"Three vehicles and a roadside unit in {town}, which the shipped weights never saw: what the ego alone misses, "
+        "which agent supplies it, and what it costs in bytes and milliseconds. All that passes between agents is bytes.",
         methods=options.replay_options.methods,
         replay=replay,
         weights=display_name(options.replay_options.weights),

@@ -156,7 +156,8 @@ def _log_drive(options: Options) -> None:
             logs.append(files.enter_context(FoxgloveLog(options.mcap, options.cloud_color)))
             openings.append((str(options.mcap), "open it with Foxglove"))
         if viewer is not None and viewer.server is not None:
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            # Not every system has SIGHUP, the end of a terminal.
+            for number in {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)}:
                 before = signal.signal(number, signal.default_int_handler)
                 files.callback(signal.signal, number, before)
             console.print(f"Open {viewer.server.page}", highlight=False, soft_wrap=True)
@@ -196,6 +197,8 @@ def _open_frames(options: Options, console: Console) -> tuple[Iterator[SpatialFr
             )
         torch.set_num_threads(read_config(options.recording).num_threads)
         total = count_ticks(options.recording)
+        if total is not None and total > options.frames:
+            console.print(f"The first {options.frames} of {total} frames; --frames {total} logs all", highlight=False)
         frames = show_run(options.recording, make_agent, options.min_score or 0.0)
         return islice(frames, options.frames), None if total is None else min(total, options.frames)
     return _open_drive(options, console)

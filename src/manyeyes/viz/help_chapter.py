@@ -11,7 +11,7 @@ from manyeyes.viz.report import Chapter
 from manyeyes.viz.scene_player import PlayerDetections, PlayerFrame, PlayerMethod, ScenePlayer
 
 HEADINGS = ("sender", "supplied", "vehicles", "sender's points", "ego's points")
-TITLE = "What the ego alone misses, and who supplied it"
+TITLE = "What the ego alone misses, and which agent supplied it"
 
 
 @dataclass

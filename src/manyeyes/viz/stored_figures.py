@@ -47,7 +47,6 @@ def _make_ap_bytes(results: Sequence[StoredResult]) -> list[Panel]:
     rows = [row for stored in results for row in stored.result["rows"]]
     names = list(dict.fromkeys(split_form(row["method"])[0] for row in rows))
     has_two_forms = len({split_form(row["method"])[1] for row in rows}) > 1
-
     has_level_with_memory = any(split_form(row["method"])[1] for row in rows if not row["bytes_per_message"])
 
     def label_of(method: str) -> str:
