@@ -124,9 +124,11 @@ class _CompiledLoop(CPUDispatcher):
     def __init__(
         self, py_func: Any, locals: Any = None, targetoptions: Any = None, pipeline_class: type[CompilerBase] = Compiler
     ) -> None:
+        # Some versions of numba take no None.
+        locals, targetoptions = locals or {}, targetoptions or {}
         super().__init__(py_func, locals, targetoptions, pipeline_class)
         without_wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-        self._linked = CPUDispatcher(py_func, locals, {**(targetoptions or {}), **without_wrappers}, _LinkedCompiler)
+        self._linked = CPUDispatcher(py_func, locals, {**targetoptions, **without_wrappers}, _LinkedCompiler)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         return self._linked.get_call_template(args, kws)
