@@ -73,7 +73,9 @@ def test_fitted_detector_shares_equal_tokens_and_has_another_fingerprint(detecto
     fitted = fit_codebook(
         detector, recording, seed=3, config=CodebookConfig(2, 32), frame_stride=2, report=reports.append
     )
-    assert reports == sorted(reports) and reports[-1] > 100
+    done = [(report.frames, report.tokens) for report in reports]
+    assert done == sorted(done) and done[0] == (0, 0) and reports[-1].tokens > 100
+    assert {report.total for report in reports} == {reports[-1].frames}
     assert fitted.fingerprint != checkpoint.fingerprint(detector)
     tokens = torch.cat(list(collect_shared_tokens(detector, recording, 2)))
     assert torch.equal(torch.cat(list(collect_shared_tokens(fitted, recording, 2))), tokens)

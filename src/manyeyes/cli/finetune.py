@@ -112,8 +112,7 @@ def _finetune(options: Options, execution: Execution, console: Console) -> None:
         began = time.process_time()
         weights = PlanRun(plan, training, options.seed, options.out, start, holdout, execution).run(card, report)
         cpu_minutes = (time.process_time() - began) / 60
-    with console.status("Evaluating the holdout before and after"):
-        results = _evaluate(holdout, (options.weights, weights), options.max_frames)
+    results = _evaluate(holdout, (options.weights, weights), options.max_frames, console)
     _write_results(options, plan, results, cpu_minutes, console)
     console.print(str(weights), highlight=False, soft_wrap=True)
 
@@ -139,17 +138,28 @@ def _open_parts(options: Options, console: Console) -> tuple[Recording, Recordin
     return split_holdout(recording, options.holdout)
 
 
-def _evaluate(holdout: Recording, weights: tuple[str | Path, ...], max_frames: int) -> tuple[BenchmarkResult, ...]:
+def _evaluate(
+    holdout: Recording, weights: tuple[str | Path, ...], max_frames: int, console: Console
+) -> tuple[BenchmarkResult, ...]:
     """Evaluate no fusion, and intermediate fusion where there are several agents, with each file of weights."""
     from manyeyes.datasets.base import iter_eval_frames
     from manyeyes.evaluation.detection.benchmark import benchmark
     from manyeyes.evaluation.detection.recording_filters import FrameStride
+    from manyeyes.viz.progress import track
 
     stride = max(1, sum(1 for _ in iter_eval_frames(holdout)) // max_frames)
     evaluated = FrameStride(holdout, stride)
     has_several = any(len(holdout.agents(name)) > 1 for name in holdout.scenarios)
     methods = ("no-fusion", "intermediate-temporal") if has_several else ("no-fusion",)
-    return tuple(benchmark(evaluated, str(path), methods) for path in weights)
+    results: list[BenchmarkResult] = []
+    with track(console, "Evaluating the holdout before and after", len(weights) * len(evaluated.scenarios)) as show:
+
+        def report(done: int, total: int) -> None:
+            show(len(results) * total + done, len(weights) * total)
+
+        for path in weights:
+            results.append(benchmark(evaluated, str(path), methods, progress=report))
+    return tuple(results)
 
 
 def _write_results(

@@ -42,7 +42,8 @@ def main(options: Options) -> None:
     from manyeyes.models.detector.codebook import CodebookConfig
     from manyeyes.studies import provenance
     from manyeyes.studies.recordings import check_files
-    from manyeyes.training.detector.codebook import fit_codebook
+    from manyeyes.training.detector.codebook import CollectionProgress, fit_codebook
+    from manyeyes.viz.progress import track
 
     torch.set_num_threads(1)
     detector, card = checkpoint.load(options.weights), checkpoint.read_card(options.weights)
@@ -50,12 +51,12 @@ def main(options: Options) -> None:
     recording = open_recording(options.data, options.split)
     console, tokens = Console(), 0
     missing = check_files(recording, options.checks, console)
-    with console.status("Tokens") as status:
+    with track(console, "Frames") as show:
 
-        def report(count: int) -> None:
+        def report(progress: CollectionProgress) -> None:
             nonlocal tokens
-            tokens = count
-            status.update(f"{count:,} tokens")
+            tokens = progress.tokens
+            show(progress.frames, progress.total)
 
         fitted = fit_codebook(
             detector, recording, options.seed, CodebookConfig(options.stages), options.frame_stride, report

@@ -13,7 +13,8 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -24,7 +25,7 @@ from manyeyes.cli.live.options import MethodOptions
 if TYPE_CHECKING:
     from rich.console import Console
 
-START_TIMEOUT_S, END_TIMEOUT_S = 600.0, 60.0
+START_TIMEOUT_S, START_DELAY_S, END_TIMEOUT_S = 600.0, 1.0, 60.0
 DEFAULT_MAP_WEIGHTS = "map-small-lidar"
 
 
@@ -210,6 +211,7 @@ def _run_processes(
     """
     from manyeyes.cli.live.rate import FRAME_S, choose_rate
     from manyeyes.runtime.clock import read_tai_ns
+    from manyeyes.viz.progress import track
 
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -220,14 +222,15 @@ def _run_processes(
         with console.status("Starting the agents"):
             seconds = [_read_ready(process) for process in processes]
         rate = options.rate or choose_rate(seconds[:num_agents], os.cpu_count() or 1, load)
-        start_ns, text = read_tai_ns() + 1_000_000_000, ""
+        start_ns, text = read_tai_ns() + round(1e9 * START_DELAY_S), ""
         for process in processes:
             assert process.stdin is not None
             process.stdin.write(f"{start_ns} {rate!r}\n")
             process.stdin.flush()
-        with console.status(f"{len(processes)} agents on the network"):
+        with track(console, f"{num_agents} agents on the network", options.frames) as show:
+            _show_frames(processes[:num_agents], options.frames, rate / FRAME_S, show)
             for process in processes[:num_agents]:
-                process.communicate(timeout=1.0 + options.frames * FRAME_S / rate * 3 + END_TIMEOUT_S)
+                process.communicate(timeout=START_DELAY_S + options.frames * FRAME_S / rate * 3 + END_TIMEOUT_S)
             for process in processes[num_agents:]:
                 process.terminate()
                 # Its fusion compiles at first use, which takes longer than the end of an agent.
@@ -236,6 +239,20 @@ def _run_processes(
     finally:
         _end(processes)
         signal.signal(signal.SIGTERM, before)
+
+
+def _show_frames(
+    processes: Sequence[subprocess.Popen[str]], total: int, frames_per_s: float, show: Callable[[int, int], None]
+) -> None:
+    """Show the frames that are due by the clock, until the last one or the end of a process."""
+    began = time.monotonic()
+    while all(process.poll() is None for process in processes):
+        due = int((time.monotonic() - began - START_DELAY_S) * frames_per_s)
+        if due >= total:
+            break
+        show(max(0, due), total)
+        time.sleep(0.2)
+    show(total, total)
 
 
 def _read_ready(process: subprocess.Popen[str]) -> float:

@@ -288,6 +288,7 @@ def benchmark(
     protocol: str = "global-sort",
     replay: ReplayConfig | None = None,
     workers: int = 1,
+    progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> BenchmarkResult:
     """Evaluate methods on all scenarios of a recording.
 
@@ -299,6 +300,7 @@ def benchmark(
         replay: channel, budget and more; by default an ideal channel with full histories, between agents within 70 m or
             the range that the reader sets.
         workers: number of processes that share the scenarios; with several, recording and detector must be picklable.
+        progress: called with the number of scenarios played, and that of all.
 
     Raises:
         ConfigError: a name is not known, or a method needs tokens that the detector does not have.
@@ -306,7 +308,9 @@ def benchmark(
     weights = str(detector) if isinstance(detector, Path) else detector
     replay = replay or ReplayConfig(warmup_frames=WARMUP_FRAMES).adapt_to(recording)
     config = BenchmarkConfig(weights, tuple(map(current_name, methods)), protocol, replay)
-    return BenchmarkResult(resolve_protocol(config), run_benchmark(partial(_return, recording), config, workers))
+    return BenchmarkResult(
+        resolve_protocol(config), run_benchmark(partial(_return, recording), config, workers, progress)
+    )
 
 
 def _return(recording: Recording) -> Recording:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -81,23 +81,38 @@ def fit_frequencies(codes: Tensor) -> Tensor:
     return torch.stack(columns)
 
 
+@dataclass(frozen=True)
+class CollectionProgress:
+    """frames: with collected tokens, of total; tokens: collected so far."""
+
+    frames: int
+    total: int
+    tokens: int
+
+
 def collect_shared_tokens(detector: Detector, recording: Recording, frame_stride: int) -> Iterator[Tensor]:
     """Yield the shared tokens (n, C + PROPOSAL_DIM) of each agent at every frame_stride-th evaluated frame.
 
     The agent processes the preceding frame too.
     """
-    for number, (scenario, index) in enumerate(iter_eval_frames(recording)):
-        if number % frame_stride:
-            continue
-        earlier = recording.snapshot(scenario, index - 1) if index else None
-        snapshot = recording.snapshot(scenario, index)
-        for frame in snapshot.frames:
-            cache = PerceptionCache(detector)
-            level = cache.level
-            for before in earlier.frames if earlier else ():
-                if before.agent_id == frame.agent_id:
-                    cache.process(level(before).levelled)
-            yield cache.process_tokens(level(frame).levelled).shared_tokens.features
+    for scenario, index in _select_frames(recording, frame_stride):
+        yield from _share_tokens(detector, recording, scenario, index)
+
+
+def _select_frames(recording: Recording, frame_stride: int) -> list[tuple[str, int]]:
+    return list(iter_eval_frames(recording))[::frame_stride]
+
+
+def _share_tokens(detector: Detector, recording: Recording, scenario: str, index: int) -> Iterator[Tensor]:
+    earlier = recording.snapshot(scenario, index - 1) if index else None
+    snapshot = recording.snapshot(scenario, index)
+    for frame in snapshot.frames:
+        cache = PerceptionCache(detector)
+        level = cache.level
+        for before in earlier.frames if earlier else ():
+            if before.agent_id == frame.agent_id:
+                cache.process(level(before).levelled)
+        yield cache.process_tokens(level(frame).levelled).shared_tokens.features
 
 
 def fit_codebook(
@@ -106,16 +121,18 @@ def fit_codebook(
     seed: int = 0,
     config: CodebookConfig | None = None,
     frame_stride: int = 10,
-    report: Callable[[int], None] = lambda tokens: None,
+    report: Callable[[CollectionProgress], None] = lambda progress: None,
 ) -> Detector:
     """Fit a codebook to every frame_stride-th evaluated frame; returns the detector with it, under a new fingerprint.
 
-    report: called with the number of tokens collected so far.
+    report: called before the first frame, and after every one.
     """
     rows: list[Tensor] = []
-    for tokens in collect_shared_tokens(detector, recording, frame_stride):
-        rows.append(tokens)
-        report(sum(map(len, rows)))
+    frames = _select_frames(recording, frame_stride)
+    report(CollectionProgress(0, len(frames), 0))
+    for number, (scenario, index) in enumerate(frames, 1):
+        rows += _share_tokens(detector, recording, scenario, index)
+        report(CollectionProgress(number, len(frames), sum(map(len, rows))))
     if not any(map(len, rows)):
         raise ConfigError(
             "No agent shares a token in these frames, so no codebook can be fitted: train the detector first."

@@ -20,7 +20,7 @@ from manyeyes.models.detector.fold_norms import fold_norms
 from manyeyes.models.score_calibration import CARD_KEY as SCORE_KEY
 from manyeyes.models.sensor_domain import CARD_KEY as SENSOR_KEY
 from manyeyes.models.token_peaks import CARD_KEY
-from manyeyes.training.detector.codebook import attach_codebook, fit_codebook
+from manyeyes.training.detector.codebook import CollectionProgress, attach_codebook, fit_codebook
 from manyeyes.training.detector.score_calibration import calibrate_detector
 from manyeyes.training.detector.task import DetectorTask, DetectorTrainConfig
 from manyeyes.training.devices import Execution
@@ -158,9 +158,9 @@ class PlanRun:
                 return path
         detector, tokens = with_config(trained, config), 0
 
-        def count(number: int) -> None:
+        def count(progress: CollectionProgress) -> None:
             nonlocal tokens
-            tokens = number
+            tokens = progress.tokens
 
         if given is not None:
             detector = attach_codebook(detector, given)
