@@ -362,6 +362,16 @@ def test_numbers_of_agents_are_evaluated_on_scenarios_that_have_them(data, weigh
 
 
 @pytest.mark.slow
+def test_numbers_of_agents_compare_methods_with_memory_with_no_fusion_with_memory(data, weights, tmp_path, panels):
+    words = ("--methods", "no-fusion-temporal", "late-temporal", "--frame-stride", 2)
+    rows = evaluate(data, weights, tmp_path, "num-agents", *words)["result"]["rows"]
+    alone, *fused = rows
+    assert [(r["num_agents"], r["method"]) for r in fused] == [(n, "late-temporal") for n in (1, 2, 3)]
+    assert (alone["num_agents"], alone["gain_over_no_fusion"]) == (1, None)
+    assert [r["gain_over_no_fusion"]["num_scenarios"] for r in fused] == [2, 2, 1]
+
+
+@pytest.mark.slow
 def test_ablation_shows_each_checkpoint_with_its_card(data, weights, tmp_path, panels) -> None:
     words = ("--frame-stride", 2, "--checkpoints", f"first={weights}", f"again={weights}")
     rows = evaluate(data, weights, tmp_path, "ablation", *words)["result"]["rows"]

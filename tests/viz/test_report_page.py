@@ -14,6 +14,7 @@ from tests.viz.chromium import Browser, find_program
 from tests.viz.test_scene_player import make_player
 
 from manyeyes.evaluation.statistics.bootstrap import Interval
+from manyeyes.evaluation.statistics.comparison import Comparison
 from manyeyes.viz.report import HtmlReport, save_report
 from manyeyes.viz.table import MethodRow
 
@@ -205,4 +206,45 @@ def test_a_page_without_a_player_shows_its_plots(page: Browser, tmp_path: Path) 
     page.open((tmp_path / "plain.html").as_uri())
     assert page.value("document.body.dataset.ready") == "0" and page.value("byId('plot-bytes').width") > 100
     assert page.value("held.methods.map((m) => [m.ap, m.interval])") == [[0.8, [0.7, 0.9]], [None, None]]
+    assert page.value("!byId('plot-forest')")
+    page.session = first
+
+
+@pytest.mark.parametrize("size", [WIDE, NARROW])
+def test_differences_are_drawn_with_their_intervals_filled_where_resolved(
+    page: Browser, tmp_path: Path, size: tuple[int, int]
+) -> None:
+    rows = tuple(
+        MethodRow(method, Interval(ap, ap - 0.05, ap + 0.05, 0.95, 5), None, 2048.0, None, None, None, name)
+        for method, ap in (("late", 0.6), ("early", 0.8))
+        for name in ("vehicle", "pedestrian")
+    )
+    differences = (
+        Comparison("early - late, vehicle", "AP@0.5", Interval(0.2, 0.1, 0.3, 0.95, 5)),
+        Comparison("early - late, pedestrian", "AP@0.5", Interval(0.0, -0.1, 0.1, 0.95, 5)),
+        Comparison("early - late, one scenario", "AP@0.5", Interval(0.1, 0.1, 0.1, 0.95, 1)),
+    )
+    save_report(HtmlReport("A split", "Two classes.", rows, differences), tmp_path / "forest.html")
+    first = page.session
+    page.open((tmp_path / "forest.html").as_uri())
+    page.resize(*size)
+    assert page.value("held.methods.map((m) => m.label)") == [
+        "late, vehicle",
+        "late, pedestrian",
+        "early, vehicle",
+        "early, pedestrian",
+    ]
+    assert page.value("held.differences.map((d) => d.value)") == [0.2, 0.0]
+    page.value("byId('plot-forest').scrollIntoView({block: 'center'})")
+    # Blue in the middle of the point of the resolved difference, paper in that of the other.
+    middle = (
+        "(() => { const c = byId('plot-forest'), pen = c.getContext('2d'), k = c.width / c.clientWidth; const out = [];"
+    )
+    middle += (
+        "for (const [x, y] of forestPoints) out.push([...pen.getImageData(x * k, y * k, 1, 1).data]); return out; })()"
+    )
+    resolved, open_ = page.value(middle)
+    assert resolved[:3] == [21, 101, 192] and open_[:3] == [255, 255, 255]
+    (x0, _), (x1, _) = page.value("forestPoints")
+    assert x1 < x0 < page.value("byId('plot-forest').clientWidth")
     page.session = first

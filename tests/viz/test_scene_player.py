@@ -110,7 +110,7 @@ def test_boxes_are_integers_and_points_are_thinned_to_their_limit(monkeypatch) -
     assert held["frames"][0]["truth"][0] == [1200, 600, 460, 190, 0, 0, 40]
     assert held["methods"][0]["frames"][0]["boxes"][1] == [2000, -1000, 460, 190, 0, 300, -1, 9, 0]
     assert held["frames"][0]["agents"][1] == [7, "pole 7", 1, 2000, 1000, 3142]
-    assert (held["alone"], held["first"]) == (0, 1)
+    assert ([method["alone"] for method in held["methods"]], held["first"]) == ([-1, 0], 1)
     size = sum(len(text) for frame in held["frames"] for text in frame["cells"])
     monkeypatch.setattr(scene_player, "MAX_POINT_BYTES", size - 1)
     thinned = to_json(make_player())
@@ -125,6 +125,16 @@ def test_the_agent_with_points_on_a_vehicle_supplied_it() -> None:
         "no-fusion finds 3, late 6" in chapter.text
         and "Of the 3 that the ego misses alone, 3 are found" in chapter.text
     )
+
+
+def test_a_method_is_compared_with_the_ego_alone_of_its_form() -> None:
+    player = make_player()
+    alone, late = player.methods
+    temporal = replace(alone, name="no-fusion-temporal"), replace(late, name="late-temporal")
+    player = replace(player, methods=(alone, *temporal, late))
+    assert [player.find_alone(method) for method in player.methods] == [-1, -1, 1, 0]
+    assert replace(player, methods=(alone, temporal[1])).find_alone(temporal[1]) == 0
+    assert replace(player, methods=(late,)).find_alone(late) == -1
 
 
 @pytest.mark.parametrize("name", ["no-fusion", "early"])

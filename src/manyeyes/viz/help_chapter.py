@@ -43,21 +43,22 @@ def make_help_chapter(player: ScenePlayer, method: str) -> Chapter | None:
     where no method without messages was run, or the named one was not.
     """
     helped = next((m for m in player.methods if m.name == method and m.needs_messages), None)
-    if player.alone < 0 or helped is None:
+    row = -1 if helped is None else player.find_alone(helped)
+    if helped is None or row < 0:
         return None
-    alone = player.methods[player.alone]
+    alone = player.methods[row]
     supplies: dict[str, _Supply] = defaultdict(_Supply)
     total = num_alone = num_helped = num_lost = 0
     for frame, own, fused in zip(player.frames, alone.frames, helped.frames):
         before, after = find_matched(own, alone.min_score), find_matched(fused, helped.min_score)
         total, num_alone, num_helped = total + len(frame.truth), num_alone + len(before), num_helped + len(after)
         num_lost += len(before - after)
-        for row in after - before:
-            agent = find_supplier(frame, row, fused.received)
+        for found in after - before:
+            agent = find_supplier(frame, found, fused.received)
             supply = supplies[_name_supplier(frame, agent)]
-            supply.ids.append(int(frame.truth.id[row]))
-            supply.own.append(int(frame.num_returns[row, agent]) if agent >= 0 else 0)
-            supply.ego.append(int(frame.num_returns[row, 0]))
+            supply.ids.append(int(frame.truth.id[found]))
+            supply.own.append(int(frame.num_returns[found, agent]) if agent >= 0 else 0)
+            supply.ego.append(int(frame.num_returns[found, 0]))
     if not supplies:
         return None
     ranked = sorted(supplies.items(), key=lambda item: -len(item[1].ids))

@@ -90,6 +90,8 @@ def render(report: HtmlReport) -> str:
             _table(*_split_headings(format_lines(report.rows))),
         ]
     if report.differences:
+        is_drawn = any(_bounds(d.interval) for d in report.differences)
+        parts += [read_asset("web/report_forest.html")] if is_drawn else []
         parts += [_table(DIFFERENCE_HEADINGS, [format_difference_cells(d) for d in report.differences])]
     parts += [f"<p>{_escape(note)}</p>" for note in report.notes]
     parts += [part for chapter in report.chapters for part in _chapter_parts(chapter)]
@@ -129,23 +131,30 @@ def _chapter_parts(chapter: Chapter) -> list[str]:
 
 
 def _page_data(report: HtmlReport) -> dict[str, Any]:
-    """Return what the script draws: numbers of the methods, of the first class where there are several, and the player."""
+    """Return what the script draws: numbers of the methods, class by class, paired differences, and the player."""
     player = report.player
     air_ms = {method.name: method.air_ms for method in player.methods} if player else {}
-    rows = {row.method: row for row in reversed(report.rows)}
+    has_classes = len({row.class_name for row in report.rows}) > 1
     methods = [
         {
-            "label": name,
+            "name": row.method,
+            "label": f"{row.method}, {row.class_name}" if has_classes else row.method,
             "ap": _number(row.ap50.value) if row.ap50 else None,
             "interval": _bounds(row.ap50),
             "bytes": _number(row.bytes_per_message),
             "share": _number(row.share_ms) if row.bytes_per_message else None,
-            "air": _number(air_ms.get(name)),
+            "air": _number(air_ms.get(row.method)),
             "perceive": _number(row.perceive_ms),
         }
-        for name, row in reversed(rows.items())
+        for row in report.rows
     ]
-    return {"methods": methods, "player": None if player is None else to_json(player), "shown": report.shown}
+    differences = [
+        {"label": d.description, "metric": d.metric, "value": _number(d.interval.value), "interval": bounds}
+        for d in report.differences
+        if (bounds := _bounds(d.interval)) is not None
+    ]
+    drive = None if player is None else to_json(player)
+    return {"methods": methods, "differences": differences, "player": drive, "shown": report.shown}
 
 
 def _bounds(value: Interval | None) -> list[float] | None:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes.agents.strategies.names import form_of
 from manyeyes.datatypes import Boxes
 
 Floats = NDArray[np.float64]
@@ -104,10 +105,16 @@ class ScenePlayer:
     first_frame: int = 0
     num_skipped: int = 0
 
-    @property
-    def alone(self) -> int:
-        """Row of the first method without messages, -1 where all need them."""
-        return next((row for row, method in enumerate(self.methods) if not method.needs_messages), -1)
+    def find_alone(self, method: PlayerMethod) -> int:
+        """Return the row of the method without messages that another is compared with, -1 for none and for those without messages.
+
+        It is the one of the same form, with or without memory; where none is, the first one.
+        """
+        alone = [row for row, other in enumerate(self.methods) if not other.needs_messages]
+        if not method.needs_messages or not alone:
+            return -1
+        form = form_of(method.name)
+        return next((row for row in alone if form_of(self.methods[row].name) == form), alone[0])
 
 
 def find_cells(xy: Floats, view: tuple[float, float, float, float]) -> Ints:
@@ -158,13 +165,13 @@ def to_json(player: ScenePlayer) -> dict[str, Any]:
         "cell": CELL_M,
         "period": player.period_s,
         "first": player.first_frame,
-        "alone": player.alone,
         "frames": [_frame(frame, cells) for frame, cells in zip(player.frames, points)],
         "methods": [
             {
                 "name": method.name,
                 "title": method.title,
                 "score": round(method.min_score, 3),
+                "alone": player.find_alone(method),
                 "frames": [_detections(d) for d in method.frames],
             }
             for method in player.methods

@@ -2,7 +2,7 @@
 """What each further agent brings: the ego with the nearest so many others, one to five in all.
 
 A row of n agents is evaluated on the scenarios that have as many, against the truth of everybody that is there; what it gains over
-one agent fewer and over no fusion is evaluated on those same scenarios.
+one agent fewer and over no fusion of its form, with or without memory, is evaluated on those same scenarios.
 """
 
 from __future__ import annotations
@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from manyeyes.agents.strategies.names import form_of
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.detection.protocols import get_protocol
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.studies.engine.conditions import Condition, ResultGrid, ResultKey
-from manyeyes.studies.engine.replay_study import NO_FUSION, prepare_study
+from manyeyes.studies.engine.replay_study import ALONE, NO_FUSION, prepare_study
 from manyeyes.studies.engine.report import StudyContext
 from manyeyes.studies.options import EvaluationOptions
 from manyeyes.viz.curves import Curve, CurvePanel
@@ -46,7 +47,7 @@ def run(options: EvaluationOptions, context: StudyContext) -> None:
     study = prepare_study(options, context)
     recording, methods = study.opener(), study.base.methods
     max_agents = min(MAX_AGENTS, max(len(recording.agents(name)) for name in recording.scenarios))
-    collaborative = tuple(m for m in methods if m != NO_FUSION)
+    collaborative = tuple(m for m in methods if m not in ALONE)
     conditions = [
         Condition(str(n), replace(study.base, num_agents=n, methods=methods if n == 1 else collaborative))
         for n in range(1, max_agents + 1)
@@ -62,7 +63,8 @@ def make_rows(results: ResultGrid) -> tuple[NumAgentsRow, ...]:
 
 
 def _make_row(results: ResultGrid, num_agents: int, method: str) -> NumAgentsRow:
-    key, fewer_key, no_fusion_key = (str(num_agents), method), (str(num_agents - 1), method), ("1", NO_FUSION)
+    key, fewer_key = (str(num_agents), method), (str(num_agents - 1), method)
+    no_fusion_key = ("1", NO_FUSION + form_of(method))
     result, scenarios = results.results[key], results.scenarios_of(key)
 
     def gain_over(other: ResultKey) -> Interval | None:
@@ -105,7 +107,7 @@ def _make_results_table(result_rows: Sequence[NumAgentsRow]) -> StudyTable:
 
 def make_panels(result_rows: Sequence[NumAgentsRow]) -> list[CurvePanel]:
     """Return AP by number of agents on all scenarios that have them, and what that is over no fusion on the same scenarios."""
-    methods = [m for m in dict.fromkeys(row.method for row in result_rows) if m != NO_FUSION]
+    methods = [m for m in dict.fromkeys(row.method for row in result_rows) if m not in ALONE]
     ap_curves, gain_curves = [], []
     for method in methods:
         method_rows = [row for row in result_rows if row.method == method]

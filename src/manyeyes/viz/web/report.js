@@ -6,6 +6,8 @@ const colour = (name) => getComputedStyle(document.documentElement).getPropertyV
 const methodColour = (row) => colour(`method-${row % 6}`);
 const agentColour = (row) => colour(`agent-${row % 6}`);
 const NARROW = 600;
+/** Name of the method of each row; several rows have one where there are several classes. */
+const methodNames = held.methods.map((m) => m.name), uniqueNames = [...new Set(methodNames)];
 
 /** Set a canvas to its width on the page and a height, and return its context in CSS pixels. */
 function prepare(canvas, height) {
@@ -64,7 +66,7 @@ function drawBytes() {
   const taken = [];
   rows.forEach((m) => {
     const x = toX(m.bytes), y = toY(m.ap);
-    pen.strokeStyle = pen.fillStyle = methodColour(held.methods.indexOf(m));
+    pen.strokeStyle = pen.fillStyle = methodColour(uniqueNames.indexOf(m.name));
     if (m.interval) { pen.beginPath(); pen.moveTo(x, toY(m.interval[0])); pen.lineTo(x, toY(m.interval[1])); pen.stroke(); }
     pen.beginPath(); pen.arc(x, y, 5, 0, 7); pen.fill();
     const length = pen.measureText(m.label).width, onLeft = x + 10 + length > right;
@@ -77,9 +79,46 @@ function drawBytes() {
   });
 }
 
+/** Middles of the points of the last drawing, CSS pixels. */
+let forestPoints = [];
+
+/** Paired differences, one line each: a point and its interval, filled where zero lies outside. */
+function drawForest() {
+  const canvas = byId("plot-forest"), rows = held.differences, lineHeight = 22, top = 8;
+  const isNarrow = canvas.clientWidth < NARROW, height = top + rows.length * lineHeight * (isNarrow ? 1.8 : 1) + 24;
+  const pen = prepare(canvas, height), width = canvas.clientWidth;
+  const text = rows.map((row) => `${row.label}, ${row.metric}`), bottom = height - 24;
+  const left = isNarrow ? 22 : Math.max(...text.map((words) => pen.measureText(words).width)) + 24, right = width - 22;
+  const low = Math.min(0, ...rows.map((row) => row.interval[0])), high = Math.max(0, ...rows.map((row) => row.interval[1]));
+  const spread = high - low || 1, step = [0.01, 0.02, 0.05, 0.1, 0.2, 0.5].find((s) => spread / s <= (isNarrow ? 5 : 8)) || 1;
+  const x0 = Math.floor(low / step) * step, x1 = Math.ceil(high / step) * step || step;
+  const toX = (value) => left + (right - left) * (value - x0) / (x1 - x0);
+  pen.lineWidth = 1; pen.textAlign = "center";
+  for (let mark = Math.round(x0 / step); mark <= Math.round(x1 / step); mark += 1) {
+    const x = toX(mark * step);
+    pen.strokeStyle = colour(mark ? "line" : "ink");
+    pen.beginPath(); pen.moveTo(x, top); pen.lineTo(x, bottom); pen.stroke();
+    pen.fillStyle = colour("soft");
+    pen.fillText((mark > 0 ? "+" : "") + (mark * step).toFixed(2), x, bottom + 16);
+  }
+  forestPoints = rows.map((row, number) => {
+    const y = isNarrow ? top + (number * 1.8 + 1.25) * lineHeight : top + (number + 0.5) * lineHeight;
+    pen.fillStyle = colour("ink");
+    pen.textAlign = isNarrow ? "left" : "right";
+    if (isNarrow) pen.fillText(text[number], 2, y - 12); else pen.fillText(text[number], left - 16, y + 4);
+    pen.strokeStyle = pen.fillStyle = colour("accent"); pen.lineWidth = 2;
+    pen.beginPath(); pen.moveTo(toX(row.interval[0]), y); pen.lineTo(toX(row.interval[1]), y); pen.stroke();
+    pen.beginPath(); pen.arc(toX(row.value), y, 5, 0, 7);
+    if (row.interval[0] * row.interval[1] <= 0) pen.fillStyle = colour("paper");
+    pen.fill(); pen.stroke();
+    return [toX(row.value), y];
+  });
+}
+
 function showStages() {
   const stages = [["share", "method-2", "share: sender's compute"], ["air", "method-1", "channel: sent to arrived"], ["perceive", "method-0", "perceive: ego's compute"]];
-  const rows = held.methods.filter((m) => m.perceive !== null);
+  const rows = held.methods.filter((m, row) => m.perceive !== null && methodNames.indexOf(m.name) === row);
+  byId("stages").parentElement.hidden = !rows.length;
   const total = (m) => stages.reduce((sum, [key]) => sum + (m[key] || 0), 0);
   const longest = Math.max(...rows.map(total), 1);
   byId("stages").replaceChildren(...rows.map((m) => {
@@ -187,7 +226,8 @@ function drawPoints(pen, view, frame, may) {
 
 /** True boxes: found ones green, missed ones dashed with a cross, those that the ego alone misses filled with the sender's colour. */
 function drawTruth(pen, view, frame, judged, may) {
-  const alone = player.alone >= 0 && player.alone !== state.method ? judge(player.alone, state.frame).found : null;
+  const without = player.methods[state.method].alone;
+  const alone = without >= 0 ? judge(without, state.frame).found : null;
   frame.truth.forEach((box, row) => {
     const outline = corners(box);
     if (judged.found.has(row)) {
@@ -334,7 +374,7 @@ function showScore() {
 
 function showKeys() {
   const agents = player.frames[state.frame].agents.map((agent, row) => ["dot", agentColour(row), agent[1]]);
-  const helped = player.alone >= 0 && player.alone !== state.method;
+  const helped = player.methods[state.method].alone >= 0;
   addKeys(byId("keys"), [
     ["box", colour("found"), "found: thick the box, thin the truth"], ["dashed", colour("missed"), "missed"], ["box", colour("false"), "false alarm"],
     ...(helped ? [["", colour("agent-1"), "filled: missed alone, found with the sender that the dotted line comes from"]] : []), ...agents,
@@ -463,6 +503,7 @@ function startPlayer() {
 
 function drawAll() {
   if (byId("plot-bytes")) { drawBytes(); showStages(); }
+  if (byId("plot-forest")) drawForest();
   if (player && perFrame.length) show();
 }
 
