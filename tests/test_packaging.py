@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from manyeyes import __version__
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 PYPROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())
 PROJECT = PYPROJECT["project"]
@@ -39,6 +41,12 @@ def test_classifiers_readme_and_constraints_name_the_same_versions() -> None:
     assert f"3.{numbers[0]} to 3.{numbers[-1]}" in (REPOSITORY / "README.md").read_text()
     header = " ".join(line.strip("# ") for line in CONSTRAINTS.splitlines() if line.startswith("#"))
     assert all(f"3.{number}" in header for number in numbers)
+
+
+def test_citation_and_changelog_name_the_version() -> None:
+    citation, changelog = ((REPOSITORY / name).read_text() for name in ("CITATION.cff", "CHANGELOG.md"))
+    assert re.findall(r"^version: (\S+)$", citation, re.MULTILINE) == [__version__]
+    assert re.findall(r"^## \[([\d.]+)\]", changelog, re.MULTILINE)[0] == __version__
 
 
 def test_every_dependency_is_pinned_to_a_version_that_its_bound_admits() -> None:

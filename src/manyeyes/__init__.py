@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from manyeyes._lazy import attach
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from manyeyes.agents.agent import Agent as Agent, Perception as Perception

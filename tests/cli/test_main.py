@@ -7,6 +7,7 @@ import json
 
 import pytest
 
+from manyeyes import __version__
 from manyeyes.cli import main as cli
 
 
@@ -90,7 +91,7 @@ def test_a_missing_file_is_one_line_and_exits_with_1(monkeypatch, capsys) -> Non
 
 def test_version(capsys) -> None:
     assert cli.main(["--version"]) == 0
-    assert capsys.readouterr().out == "manyeyes 0.1.0\n"
+    assert capsys.readouterr().out == f"manyeyes {__version__}\n"
 
 
 def test_doctor_prints_json_for_a_bug_report(capsys) -> None:
