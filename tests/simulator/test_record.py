@@ -184,8 +184,8 @@ def test_misuse_is_named(tmp_path: Path) -> None:
 _POOL = """
 import multiprocessing, os, time
 from concurrent.futures import ProcessPoolExecutor
-from manyeyes.simulator.record import _start_worker
-with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _start_worker) as pool:
+from manyeyes._workers import start_worker
+with ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), start_worker) as pool:
     print(pool.submit(os.getpid).result(), flush=True)
     pool.submit(time.sleep, 100).result()
 """

@@ -4,11 +4,18 @@
 Three connected vehicles and a roadside unit meet at a crossing with traffic, buildings and occlusion. Detections of no fusion,
 late, intermediate and early fusion, all with the same memory of two frames, are compared on the same channel; --methods selects
 others. The report plays the drive with every method, and shows what the ego alone misses and which agent supplied it. A map of a
-crossroads is fused too, from the local maps of a simulated fleet.
+crossroads is fused too, from the local maps of a simulated fleet, in a process beside that of the drive.
 """
 
 from __future__ import annotations
 
+import multiprocessing
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,8 +25,7 @@ from manyeyes.datatypes import ConfigError
 from manyeyes.studies.replay_options import WITH_MEMORY, ReplayOptions, display_name, make_excerpt
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
+    from manyeyes.cli.demo_map import DemoMapStats
     from manyeyes.viz.report import Chapter
 
 PRESET = "demo"
@@ -51,13 +57,14 @@ def main(options: Options) -> None:
     """Simulate a drive, evaluate the methods on it, and write a report."""
     from manyeyes._lock import hold_folder
 
-    with hold_folder(options.out):
-        _run_demo(options)
+    with hold_folder(options.out), _start_map(options.out / "map", options.seed) as take_map:
+        _run_demo(options, take_map)
 
 
-def _run_demo(options: Options) -> None:
+def _run_demo(options: Options, take_map: Callable[[], tuple[DemoMapStats, Chapter]]) -> None:
     from rich.console import Console
 
+    from manyeyes.cli.demo_map import describe_crossing_map
     from manyeyes.datasets.registry import open_recording
     from manyeyes.models import pretrained
     from manyeyes.simulator.presets import simulate
@@ -102,19 +109,39 @@ def _run_demo(options: Options) -> None:
         ),
     )
     report, report_path = replay_and_report(drive, detector, spec, console), options.out / REPORT
-    # The report of the detections is on disk before the map begins, so that nothing of it is lost where the map fails.
-    chapter, summary = _make_map_chapter(options.out / "map", options.seed, console)
+    # The report of the detections is on disk before the map is taken, so that nothing of it is lost where the map failed.
+    with console.status("Mapping a crossroads"):
+        stats, chapter = take_map()
     save_report(replace(report, chapters=(chapter, *report.chapters)), report_path)
-    console.print(f"\n{summary}", highlight=False, soft_wrap=True)
+    console.print(f"\n{describe_crossing_map(stats)}", highlight=False, soft_wrap=True)
     console.print(
         f"\nPictures, animation and JSON are in {options.out}; open {report_path}", highlight=False, soft_wrap=True
     )
 
 
-def _make_map_chapter(out: Path, seed: int, console: Console) -> tuple[Chapter, str]:
-    """Return the map part of the report, and its summary in one line."""
-    from manyeyes.cli.demo_map import describe_crossing_map, map_crossing
+@contextmanager
+def _start_map(out: Path, seed: int) -> Iterator[Callable[[], tuple[DemoMapStats, Chapter]]]:
+    """Map the crossroads in a process of its own; yield a function that waits for the map, or raises what ended it.
 
-    with console.status("Mapping a crossroads"):
-        stats, chapter = map_crossing(out, seed)
-    return chapter, describe_crossing_map(stats)
+    A fork where no thread could hold a lock in it: it imports nothing anew. The process ends with the block.
+    """
+    from manyeyes.cli.demo_map import map_crossing
+
+    is_safe = sys.platform == "linux" and threading.active_count() == 1
+    context = multiprocessing.get_context("fork" if is_safe else "spawn")
+    with ProcessPoolExecutor(1, context, _start_map_process) as pool:
+        future = pool.submit(map_crossing, out, seed)
+        try:
+            yield future.result
+        except BaseException:
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+
+
+def _start_map_process() -> None:
+    from manyeyes._workers import start_worker
+
+    # The process of the drive ends this one.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    start_worker()

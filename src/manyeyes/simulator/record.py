@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import os
 import platform
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -17,13 +16,13 @@ from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from threading import Thread
 from typing import Any, TypeVar
 
 import torch
 
 from manyeyes._io import atomic_rename, atomic_write_text, flush_files, remove_unfinished
 from manyeyes._lock import hold_folder
+from manyeyes._workers import start_worker
 from manyeyes.datasets.formats.yaml_file import load_yaml
 from manyeyes.datasets.manifest import (
     MANIFEST,
@@ -233,7 +232,7 @@ def run_jobs(
             yield job, work(job, root)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, max(1, len(jobs))), context, _start_worker) as pool:
+    with ProcessPoolExecutor(min(workers, max(1, len(jobs))), context, start_worker) as pool:
         running: dict[Future[ManifestEntry], JobT] = {pool.submit(work, job, root): job for job in jobs}
         try:
             while running:
@@ -242,20 +241,6 @@ def run_jobs(
                     yield job, future.result()
         finally:
             pool.shutdown(cancel_futures=True)
-
-
-def _start_worker() -> None:
-    os.environ["OMP_NUM_THREADS"] = "1"
-    torch.set_num_threads(1)
-    Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """End this process when the one that started it was killed: it must not write to a folder that another run may continue."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
 
 
 @lru_cache(maxsize=2)
