@@ -9,10 +9,10 @@ import pytest
 from manyeyes._records import load_record, save_record
 from manyeyes.datatypes import ConfigError
 from manyeyes.maps.formats.attributes import to_hex_ids
-from manyeyes.maps.fusion.agent_weights import REJECTED_WEIGHT
 from manyeyes.maps.fusion.fuse import MapFusionConfig, fuse
 from manyeyes.maps.fusion.observation_arrays import to_observation_arrays
 from manyeyes.maps.fusion.pose_optimization import solve_poses
+from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT
 from manyeyes.maps.store.executors import InlineExecutor, make_executor
 from manyeyes.maps.store.observation_log import read_active
 from manyeyes.maps.store.store import MapStore

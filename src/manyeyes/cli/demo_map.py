@@ -18,7 +18,8 @@ from manyeyes.evaluation.maps.experiment import FleetExperiment, FleetTrial, run
 from manyeyes.evaluation.maps.metrics import MapMetrics, evaluate_map
 from manyeyes.evaluation.maps.registry import fuse_experiment, fuse_observations, make_tuned_settings
 from manyeyes.maps.elements.observation import Observation
-from manyeyes.maps.fusion.pose_optimization import PoseSolution, solve_poses
+from manyeyes.maps.fusion.pose_optimization import solve_poses
+from manyeyes.maps.fusion.pose_solution import PoseSolution
 from manyeyes.maps.registry import OURS
 from manyeyes.simulator.fleet.config import crowd_config
 from manyeyes.studies.map_folder import MapFolder, write_vector_map

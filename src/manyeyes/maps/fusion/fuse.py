@@ -33,7 +33,8 @@ from manyeyes.maps.fusion.observation_arrays import to_observation_arrays
 from manyeyes.maps.fusion.parallel_extension import ParallelExtensionConfig, extend_parallel
 from manyeyes.maps.fusion.polyline_linking import LinkConfig, link_stations, smooth_chains
 from manyeyes.maps.fusion.pose_config import PoseSolverConfig
-from manyeyes.maps.fusion.pose_optimization import PoseSolution, solve_poses
+from manyeyes.maps.fusion.pose_optimization import solve_poses
+from manyeyes.maps.fusion.pose_solution import PoseSolution
 from manyeyes.maps.fusion.stations import (
     Area,
     StationConfig,

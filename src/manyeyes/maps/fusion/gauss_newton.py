@@ -2,7 +2,7 @@
 """One damped Gauss-Newton step of each observation's pose on point-to-line residuals, with a pose prior.
 
 Residuals are lateral, along the mean normal of both lines, which has no bias on a bend. Each point has a total weight of at
-most one. The prior is the prior pose, corrected by the bias of its drive.
+most one. It aligns one observation to a fixed map (:mod:`manyeyes.maps.fusion.incremental`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import Boolx1, F64x1, F64x2, F64x3, I64x1, njit, set_row, set_rows
+from manyeyes._jit import Boolx1, F64x1, F64x2, F64x3, I64x1, njit, set_rows
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays
 from manyeyes.maps.fusion.point_grid import find_cell_range, line_residual
 
@@ -32,18 +32,16 @@ _SolverParams = tuple[float, float, float, float, float, float]
 
 @njit(cache=True, nogil=True)
 def build_normal_equations(
-    home: I64x1, own_points: _OwnPoints, other_points: _OtherPoints, params: _SolverParams, point_stride: int = 1
+    home: I64x1, own_points: _OwnPoints, other_points: _OtherPoints, params: _SolverParams
 ) -> F64x2:  # pragma: no cover - compiled
-    """Build the normal equations (H, 13) of the home observations.
+    """Build the normal equations (H, 11) of the home observations.
 
-    Columns: pivot x, y; information xx, xy, xt, yy, yt, tt; right side x, y, t; weighted sum of squared residuals (m²); sum of
-    point weights. Of each observation every ``point_stride``-th point counts.
+    Columns: pivot x, y; information xx, xy, xt, yy, yt, tt; right side x, y, t.
     """
     first, xy, tangent, kind, sigma = own_points
     cell, keys, start, rxy, rtangent, robservation, rweight = other_points
     gate, kernel, reach, cosine, scatter, correlation = params
-    correlation /= point_stride
-    out = np.zeros((len(home), 13))
+    out = np.zeros((len(home), 11))
     c2, far = kernel * kernel, gate * gate + reach * reach
     radius, shorter = np.sqrt(far), 1.0 / reach
     for h in range(len(home)):
@@ -53,10 +51,10 @@ def build_normal_equations(
             continue
         px, py = xy[a:b, 0].mean(), xy[a:b, 1].mean()
         out[h, 0], out[h, 1] = px, py
-        for p in range(a, b, point_stride):
+        for p in range(a, b):
             x, y, u, v = xy[p, 0], xy[p, 1], tangent[p, 0], tangent[p, 1]
             lowest, highest = int(np.floor((y - radius) / cell)), int(np.floor((y + radius) / cell))
-            total, pull, square = 0.0, 0.0, 0.0
+            total, pull = 0.0, 0.0
             for ix in range(int(np.floor((x - radius) / cell)), int(np.floor((x + radius) / cell)) + 1):
                 low, high = find_cell_range(keys, start, kind[p], ix, lowest, highest)
                 for q in range(low, high):
@@ -71,7 +69,6 @@ def build_normal_equations(
                     w = rweight[q] * g * g * (1.0 - along * shorter)
                     total += w
                     pull += w * aside
-                    square += w * aside * aside
             if total <= 0.0:
                 continue
             vote = total / (total + 0.5)
@@ -88,60 +85,38 @@ def build_normal_equations(
             out[h, 8] += w * jx * aside
             out[h, 9] += w * jy * aside
             out[h, 10] += w * jt * aside
-            out[h, 11] += vote * aside * aside
-            out[h, 12] += vote
     return out
 
 
 def step_poses(
-    arrays: ObservationArrays,
-    home: Ints,
-    states: tuple[Floats, Floats, Floats],
-    normal_sums: Floats,
-    config: PoseSolverConfig,
-) -> dict[str, Floats]:
-    """Compute the columns of a PoseSolution that a sweep changes, for the home rows.
+    arrays: ObservationArrays, home: Ints, states: tuple[Floats, Floats], normal_sums: Floats, config: PoseSolverConfig
+) -> tuple[Floats, Floats]:
+    """Step the home rows: poses (H, 3) and their covariances (H, 3, 3).
 
-    states: initial pose, prior mean and pose (O, 3) of all observations. normal_sums: (H, 13) of
-    :func:`build_normal_equations`.
+    states: initial pose and pose (O, 3) of all observations. normal_sums: (H, 11) of :func:`build_normal_equations`.
     """
-    start, prior_mean, pose = (np.ascontiguousarray(rows[home]) for rows in states)
+    start, pose = (np.ascontiguousarray(rows[home]) for rows in states)
     prior = np.ascontiguousarray(np.asarray(arrays.covariance)[home])
-    params = (config.max_variance_ratio, config.prior_scale, config.damping)
-    trusted = np.asarray(arrays.trusted)[home]
-    next_pose, covariance, observability, information_matrix, information_vector = _step_all(
-        normal_sums, start, prior_mean, pose, prior, trusted, params
-    )
-    return {
-        "pose": next_pose,
-        "covariance": covariance,
-        "observability": observability,
-        "information_matrix": information_matrix,
-        "information_vector": information_vector,
-        "residual": normal_sums[:, 11],
-        "num_matched": normal_sums[:, 12],
-    }
+    params = (config.max_variance_ratio, config.align_prior_scale, config.damping)
+    return _step_all(normal_sums, start, pose, prior, np.asarray(arrays.trusted)[home], params)
 
 
 @njit(cache=True, nogil=True)
 def _step_all(
     normal_sums: F64x2,
     start: F64x2,
-    prior_mean: F64x2,
     pose: F64x2,
     prior: F64x3,
     trusted: Boolx1,
     params: tuple[float, float, float],
-) -> tuple[F64x2, F64x3, F64x2, F64x3, F64x2]:  # pragma: no cover - compiled
+) -> tuple[F64x2, F64x3]:  # pragma: no cover - compiled
     """Solve the damped step of each home observation.
 
-    Returns poses (H, 3), covariances (H, 3, 3), observability (H, 3), and information matrix (H, 3, 3) and vector (H, 3) of the
-    lines.
+    Returns poses (H, 3) and covariances (H, 3, 3).
     """
     max_variance_ratio, prior_scale, damping = params
     count = len(normal_sums)
-    next_pose, covariance, observability = np.empty((count, 3)), np.empty((count, 3, 3)), np.empty((count, 3))
-    information_matrix, information_vector = np.empty((count, 3, 3)), np.empty((count, 3))
+    next_pose, covariance = np.empty((count, 3)), np.empty((count, 3, 3))
     jacobian, information = np.eye(3), np.empty((3, 3))
     limit = np.array([1.0, 1.0, 0.05])
     for h in range(count):
@@ -154,15 +129,14 @@ def _step_all(
                 k += 1
         moved = pose[h] - start[h]
         moved[2] = (moved[2] + np.pi) % (2 * np.pi) - np.pi
-        off = moved - prior_mean[h]
         # Whitened by the prior, the eigenvalues of the information are ratios of prior to data variance.
         inverse = np.linalg.inv(jacobian)
         root = np.linalg.cholesky(inverse @ prior[h] @ inverse.T)
         strength, axes = np.linalg.eigh(root.T @ information @ root)
         strength = np.maximum(strength, 0.0)
         observed_strength = np.where(1.0 / (1.0 + strength) <= max_variance_ratio, strength, 0.0)
-        weighted = np.linalg.solve(prior[h], off)
-        distance = np.sum(off * weighted)
+        weighted = np.linalg.solve(prior[h], moved)
+        distance = np.sum(moved * weighted)
         trust = (prior_scale**2 / (prior_scale**2 + distance)) ** 2
         pull = axes.T @ (root.T @ normal_sums[h, 8:11])
         for i in range(3):
@@ -178,10 +152,6 @@ def _step_all(
         next_pose[h, 0], next_pose[h, 1] = px + c * ax - s * ay + step[0], py + s * ax + c * ay + step[1]
         next_pose[h, 2] = pose[h, 2] + step[2]
         spread = jacobian @ root @ axes
-        outward = np.ascontiguousarray(np.linalg.inv(spread).T)
         narrow = (spread / (1.0 + observed_strength)) @ spread.T
         set_rows(covariance[h], (narrow + narrow.T) / 2)
-        set_rows(information_matrix[h], (outward * observed_strength) @ outward.T)
-        set_row(observability[h], np.sort(observed_strength / (1.0 + strength)))
-        set_row(information_vector[h], information_matrix[h] @ moved + outward @ pull)
-    return next_pose, covariance, observability, information_matrix, information_vector
+    return next_pose, covariance

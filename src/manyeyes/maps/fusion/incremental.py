@@ -168,7 +168,7 @@ class IncrementalMap:
     def _estimate_pose(self, s: ObservationArrays) -> tuple[Floats, Floats]:
         """Estimate the pose (1, 3) and covariance (1, 3, 3) of one observation against the map."""
         config, station_grid, home = self.config.fusion.pose_solver, self._merged_stations, np.zeros(1, np.int64)
-        one = replace(config, gates_m=self.config.gates_m, kernels_m=self.config.kernels_m, damping=1.0)
+        one = replace(config, damping=1.0)
         pose, covariance = np.array(s.pose), np.array(s.covariance)
         if not len(station_grid) or not len(s.xy):
             return pose, covariance
@@ -180,7 +180,7 @@ class IncrementalMap:
             ),
         )
         begin = pose
-        for gate, kernel in zip(one.gates_m, one.kernels_m):
+        for gate, kernel in zip(self.config.gates_m, self.config.kernels_m):
             xy, tangent = s.to_world(pose)
             sums = build_normal_equations(
                 home,
@@ -203,8 +203,7 @@ class IncrementalMap:
                     one.points_per_independent,
                 ),
             )
-            columns = step_poses(s, home, (begin, np.zeros((1, 3)), pose), sums, one)
-            pose, covariance = columns["pose"], columns["covariance"]
+            pose, covariance = step_poses(s, home, (begin, pose), sums, one)
         return pose, covariance
 
     def _update_crossings(self, s: ObservationArrays, pose: Floats, confirmed: int, missed: int) -> tuple[int, int]:

@@ -5,23 +5,37 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from manyeyes.maps.fusion.coarse_search import CoarseSearchConfig
+
+
+@dataclass(frozen=True)
+class JointIteration:
+    """Widths of one joint step.
+
+    gate_m, kernel_m: lateral gate and Geman-McClure scale of the pairs, metres. prior_scale: Geman-McClure scale of the
+        priors, in
+    standard deviations. point_stride: every n-th point of an observation is used.
+    """
+
+    gate_m: float
+    kernel_m: float
+    prior_scale: float
+    point_stride: int = 1
 
 
 @dataclass(frozen=True)
 class SolverStep:
     """One step of the schedule.
 
-    gate_and_kernel_m: gate and kernel of a sweep, metres; None: repeat the coarse search.
-    is_rejection_pass: whether the step belongs to a rejection pass.
-    reinstates: whether rejected agents are re-evaluated after it.
-    point_stride: every n-th point of an observation is used.
+    joint: widths of a joint step; None: repeat the coarse search. decides: agents are rejected, or reinstated, after the step.
+    is_last: the step also gives the marginal covariance.
     """
 
-    gate_and_kernel_m: tuple[float, float] | None
-    is_rejection_pass: bool
-    reinstates: bool
-    point_stride: int = 1
+    joint: JointIteration | None
+    decides: bool = False
+    is_last: bool = False
 
 
 @dataclass(frozen=True)
@@ -29,68 +43,80 @@ class PoseSolverConfig:
     """Configuration of the pose optimization.
 
     spacing_m: distance of the sampled points.
-    rejection_gates_m, rejection_kernels_m: lateral gate and Geman-McClure scale of each sweep of a rejection pass;
-        num_rejection_passes: number of such passes, each followed by a restart; rejection_point_stride: every n-th point is
-        used in them.
-    gates_m, kernels_m: lateral gate and Geman-McClure scale of each sweep of the final pass.
-    max_longitudinal_m, max_heading_rad: longitudinal and heading gate of neighbours.
-    sigma_m: standard deviation of lines of other observations. points_per_independent: points of one line that count as one.
-    damping: fraction of a step that is taken. prior_scale: Geman-McClure scale of the prior, in standard deviations.
-    max_variance_ratio: posterior over prior variance above which a direction keeps the prior.
+    num_iterations: joint steps of the final pass; num_rejection_iterations: of a rejection pass; num_rejection_passes: number
+        of such
+        passes, each followed by a repeated search; rejection_point_stride: every n-th point is used in them.
+    gate_m, kernel_m, prior_scale: first and last lateral gate, Geman-McClure scale of the pairs, and Geman-McClure scale of
+        the priors
+        in standard deviations. They fall geometrically over the first settled_fraction of a pass and then stay.
+    max_longitudinal_m, max_heading_rad: longitudinal and heading gate of pairs.
+    sigma_m: standard deviation of the lines beside their own. points_per_independent: points of one line that count as one.
+    surveyed_weight: weight of a surveyed pole's lines.
+    max_step_m, max_step_rad: largest correction in one step.
     max_observations_per_cell: observations that count per cell of 8 m, class and heading.
-    gauge_radius_m: radius of the gauge offset; gauge_scale, rejection_gauge_scale: its Geman-McClure scale in standard
-        deviations, in the final and the rejection passes.
-    agent_scale: Geman-McClure scale of an agent's mean correction, in standard deviations; rejection_agent_scale: limit of
-        rejection.
-    drive_correlation: fraction of the prior variance that is common to a drive; drive_scale: Geman-McClure scale of that bias,
-        in standard deviations.
+    drive_fraction: fraction of the prior variance that is common to a drive. drift_length_m: distance after which the random
+        walk of a
+        drive's bias has that variance again. max_drive_gap_m: longer gaps end a drive.
+    agent_scale: Geman-McClure scale of an agent's mean correction; max_agent_error: limit of rejection; both in standard
+        deviations.
+    observation_error_m: standard deviation of corrections beside that of the prior pose, from errors that all lines of an
+        observation share.
+    damping, align_prior_scale, max_variance_ratio: of the alignment of one observation to a fixed map: fraction of a step that is
+        taken, Geman-McClure scale of the prior in standard deviations, and posterior over prior variance above which a direction
+        keeps the prior.
     coarse_search: configuration of the coarse search.
     """
 
     spacing_m: float = 1.0
-    rejection_gates_m: tuple[float, ...] = (2.0, 2.0, 1.3, 0.8)
-    rejection_kernels_m: tuple[float, ...] = (0.8, 0.8, 0.5, 0.35)
+    num_iterations: int = 12
+    num_rejection_iterations: int = 6
     num_rejection_passes: int = 2
     rejection_point_stride: int = 3
-    gates_m: tuple[float, ...] = (2.0, 2.0, 1.6, 1.3, 1.0, 0.8, 0.8, 0.8)
-    kernels_m: tuple[float, ...] = (0.8, 0.8, 0.6, 0.5, 0.4, 0.35, 0.35, 0.35)
+    gate_m: tuple[float, float] = (2.0, 1.0)
+    kernel_m: tuple[float, float] = (0.8, 0.5)
+    prior_scale: tuple[float, float] = (9.0, 3.0)
+    settled_fraction: float = 0.75
     max_longitudinal_m: float = 1.0
     max_heading_rad: float = 0.31
-    sigma_m: float = 0.2
-    points_per_independent: float = 8.0
-    damping: float = 0.7
-    prior_scale: float = 3.0
-    max_variance_ratio: float = 0.8
+    sigma_m: float = 0.12
+    points_per_independent: float = 5.0
+    surveyed_weight: float = 50.0
+    max_step_m: float = 1.0
+    max_step_rad: float = 0.05
     max_observations_per_cell: int = 32
-    gauge_radius_m: float = 250.0
-    gauge_scale: float = 1.25
-    rejection_gauge_scale: float = 1.0
+    drive_fraction: float = 0.5
+    drift_length_m: float = 2400.0
+    max_drive_gap_m: float = 300.0
     agent_scale: float = 2.0
-    rejection_agent_scale: float = 2.5
-    drive_correlation: float = 0.5
-    drive_scale: float = 3.0
+    max_agent_error: float = 2.5
+    observation_error_m: float = 0.1
+    damping: float = 0.7
+    align_prior_scale: float = 3.0
+    max_variance_ratio: float = 0.8
     coarse_search: CoarseSearchConfig = field(default_factory=CoarseSearchConfig)
 
     @property
     def schedule(self) -> tuple[SolverStep, ...]:
-        """The steps after the first search: for each rejection pass its sweeps and a search, then the final sweeps."""
-        rejection_widths, last = (
-            tuple(zip(self.rejection_gates_m, self.rejection_kernels_m)),
-            len(self.rejection_gates_m) - 1,
-        )
+        """The steps after the first search: for each rejection pass its joint steps and a search, then the final joint steps."""
+        rejection = self._anneal(self.num_rejection_iterations, self.rejection_point_stride)
         out: list[SolverStep] = []
-        for rejection_pass in range(self.num_rejection_passes):
-            out += [
-                SolverStep(width, True, rejection_pass == 0 or k == last, self.rejection_point_stride)
-                for k, width in enumerate(rejection_widths)
-            ]
-            out.append(SolverStep(None, True, False))
-        return (*out, *(SolverStep(width, False, False) for width in zip(self.gates_m, self.kernels_m)))
+        for _ in range(self.num_rejection_passes):
+            out += [SolverStep(one, decides=one is rejection[-1]) for one in rejection]
+            out.append(SolverStep(None))
+        final = self._anneal(self.num_iterations, 1)
+        return (*out, *(SolverStep(one, is_last=one is final[-1]) for one in final))
 
     @property
     def num_steps(self) -> int:
         """The number of steps after the first search."""
         return len(self.schedule)
+
+    def _anneal(self, count: int, point_stride: int) -> list[JointIteration]:
+        """Make the widths of a pass of joint steps."""
+        share = np.minimum(1.0, np.arange(count) / max(1.0, np.floor(count * self.settled_fraction)))
+        columns = [a * (b / a) ** share for a, b in (self.gate_m, self.kernel_m, self.prior_scale)]
+        gate, kernel, prior = (column.tolist() for column in columns)
+        return [JointIteration(gate[k], kernel[k], prior[k], point_stride) for k in range(count)]
 
 
 DEFAULT_ALIGN = PoseSolverConfig()

@@ -1,129 +1,62 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joint pose correction of all observations: robust, damped Gauss-Newton on point-to-line residuals with a pose prior.
+"""Joint pose correction of all observations and drives: robust nonlinear least squares on the lines that observations share.
 
-Each sweep moves every observation towards the lines of the others as they were before the sweep (Jacobi iteration), so the
-order of observations has no effect. Residuals are lateral, along the mean normal of both lines, which has no bias on a bend.
-Each point has a total weight of at most one. The prior is the prior pose, corrected by the bias of the drive
-(:mod:`manyeyes.maps.fusion.drive_bias`). Directions that no line determines, such as along a straight road, keep the prior.
+The unknowns are the pose of every observation and the error of every drive's prior poses
+(:mod:`manyeyes.maps.fusion.joint_solver`); the stations of the lines are eliminated
+(:mod:`manyeyes.maps.fusion.pair_system`). Each step
+associates points at the current poses, then solves one sparse system for all unknowns, so the order of observations has no
+effect.
+Kernels narrow from step to step (graduated non-convexity). Directions that no line determines, such as along a straight road,
+keep
+the prior.
 
-The solution runs in passes. A rejection pass is a few sweeps after which agents are rejected whose corrections share an offset
-beyond what their covariance explains. Then the solution starts again from the prior poses without the lines of those agents, so
-that a rejected agent influences neither the coarse search nor intermediate poses. The second rejection pass uses inlier agents
-alone and re-evaluates all agents at its end, so that wrongly rejected agents are reinstated. The final pass uses a wider kernel
-for the gauge offset, which is more accurate once malicious agents are rejected.
+The solution runs in passes. A rejection pass ends with a decision which agents' prior poses share a bias that their
+covariance does
+not explain. Then the solution starts again from the prior poses without the lines of those agents, so that a rejected agent
+influences neither the coarse search nor intermediate poses. The second rejection pass uses inlier agents alone and decides on all
+agents again at its end, so that wrongly rejected agents are reinstated. A rejected agent's observations are aligned to the
+others.
 
-A step of an observation depends only on observations that overlap it. So a large area can be solved tile by tile with the same
-result: :func:`search_coarse_poses` and each :func:`run_step` run for the home observations of each tile, given all observations
-that :func:`find_overlapping` returns and the poses after the previous step. :func:`merge_solutions` joins the results of the
-tiles. :func:`solve_poses` is the case of one tile.
+The association and the sums of an observation depend only on observations that overlap it. So a large area is handled tile by
+tile
+with the same result: :func:`search_coarse_poses` and each :func:`run_step` run for the home observations of each tile, given all
+observations that :func:`find_overlapping` returns and the poses after the previous step. :func:`merge_solutions` joins the
+sums of the
+tiles and solves. :func:`solve_poses` is the case of one tile. The map is defined as the result of the fixed number of steps.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.maps.elements.observation import Observation
-from manyeyes.maps.fusion.agent_weights import (
-    REJECTED_WEIGHT,
-    compute_observability,
-    compute_observation_weights,
-    estimate_agent_weights,
-    estimate_gauge_offset,
-)
 from manyeyes.maps.fusion.coarse_search import search_coarse
-from manyeyes.maps.fusion.drive_bias import estimate_drive_bias
-from manyeyes.maps.fusion.gauss_newton import build_normal_equations, step_poses
+from manyeyes.maps.fusion.joint_solver import (
+    JointPriors,
+    JointStep,
+    PairBlocks,
+    compute_marginal_covariance,
+    estimate_agent_weights,
+    make_drive_chain,
+    solve_joint_step,
+)
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays, to_observation_arrays
+from manyeyes.maps.fusion.pair_system import OtherPoints, OwnPoints, PairLimits, sum_pairs
 from manyeyes.maps.fusion.point_grid import build_grid, cell_key, limit_observations
-from manyeyes.maps.fusion.pose_config import DEFAULT_ALIGN, PoseSolverConfig
+from manyeyes.maps.fusion.pose_config import DEFAULT_ALIGN, JointIteration, PoseSolverConfig
+from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT, PairSums, PoseSolution, make_initial_solution
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _BOUND_CELL_M = 8.0
-_SWEEP_CELL_M = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class PoseSolution:
-    """Corrected poses of O observations, ids ascending.
-
-    ids: (O,) hexadecimal. agents, drives: (O,) names; a drive belongs to one agent.
-    prior_covariance: (O, 3, 3) of the prior pose. initial_pose: (O, 3) after the coarse search, the prior pose where it found
-        no shift.
-    pose: (O, 3) and covariance: (O, 3, 3) of it.
-    scale: (O,) metres, robust residual scale of the agent's lines.
-    observability: (O, 3) from 0 (prior alone) to 1, ascending, of the three principal directions of the pose.
-    residual: (O,) m², weighted sum of squared residuals; num_matched: (O,) number of points with neighbours.
-    relative_offset: (O, 2) metres, correction relative to observations nearby.
-    agent_weight: (O,) in (0, 1], see :func:`~manyeyes.maps.fusion.agent_weights.estimate_agent_weights`.
-    gauge_weight: (O,) weight of the prior pose in the gauge offset; 0 if the search shifted it.
-    is_surveyed: (O,) 1 for surveyed poles. search_shift: (O, 2) metres, shift by the coarse search.
-    information_matrix: (O, 3, 3) of the lines; information_vector: (O, 3), that times the correction of initial_pose that they
-        give.
-    prior_mean: (O, 3) mode of the prior, relative to initial_pose.
-    """
-
-    ids: tuple[str, ...]
-    agents: tuple[str, ...]
-    drives: tuple[str, ...]
-    prior_covariance: Floats
-    initial_pose: Floats
-    pose: Floats
-    covariance: Floats
-    scale: Floats
-    observability: Floats
-    residual: Floats
-    num_matched: Floats
-    relative_offset: Floats
-    agent_weight: Floats
-    gauge_weight: Floats
-    is_surveyed: Floats
-    search_shift: Floats
-    information_matrix: Floats
-    information_vector: Floats
-    prior_mean: Floats
-
-    def row_indices(self, ids: Sequence[str]) -> Ints:
-        """Return the rows of these ids."""
-        place = {name: k for k, name in enumerate(self.ids)}
-        return np.array([place[name] for name in ids], np.int64)
-
-    def take(self, rows: Ints) -> PoseSolution:
-        """Return the chosen rows, in the order given."""
-        return PoseSolution(
-            tuple(self.ids[k] for k in rows.tolist()),
-            tuple(self.agents[k] for k in rows.tolist()),
-            tuple(self.drives[k] for k in rows.tolist()),
-            *(getattr(self, name)[rows] for name in _COLUMNS),
-        )
-
-
-_STATE = (
-    "prior_covariance",
-    "initial_pose",
-    "pose",
-    "covariance",
-    "scale",
-    "observability",
-    "residual",
-    "num_matched",
-)
-_COLUMNS = (
-    *_STATE,
-    "relative_offset",
-    "agent_weight",
-    "gauge_weight",
-    "is_surveyed",
-    "search_shift",
-    "information_matrix",
-    "information_vector",
-    "prior_mean",
-)
+_PAIR_CELL_M = 1.0
+# Of the upper triangle (xx, xy, xt, yy, yt, tt), the entries of a symmetric matrix in order of rows.
+_SYMMETRIC = [0, 1, 2, 1, 3, 4, 2, 4, 5]
 
 
 def solve_poses(observations: Sequence[Observation], config: PoseSolverConfig = DEFAULT_ALIGN) -> PoseSolution:
@@ -133,9 +66,8 @@ def solve_poses(observations: Sequence[Observation], config: PoseSolverConfig = 
     state = merge_solutions([search_coarse_poses(arrays, home, config)], config)
     keep = None
     for number in range(config.num_steps):
-        if (
-            number == 0 or config.schedule[number - 1].gate_and_kernel_m is None
-        ):  # after a search, which alone changes the initial poses
+        if number == 0 or config.schedule[number - 1].joint is None:
+            # After a search, which alone changes the initial poses.
             keep = limit_per_cell(
                 arrays, state.initial_pose[state.row_indices(arrays.ids)], config.max_observations_per_cell
             )
@@ -160,34 +92,6 @@ def find_overlapping(
     return sorted((observations[k] for k in np.flatnonzero(chosen).tolist()), key=lambda o: o.id)
 
 
-def make_initial_solution(arrays: ObservationArrays) -> PoseSolution:
-    """Make the solution at the prior poses, ids ascending."""
-    count = len(arrays)
-    pose = np.array(arrays.pose)
-    start = PoseSolution(
-        arrays.ids,
-        tuple(arrays.agents[a] for a in arrays.agent.tolist()),
-        arrays.drives,
-        np.array(arrays.covariance),
-        pose,
-        pose,
-        np.array(arrays.covariance),
-        np.full(count, 0.2),
-        np.zeros((count, 3)),
-        np.zeros(count),
-        np.zeros(count),
-        np.zeros((count, 2)),
-        np.ones(count),
-        compute_observation_weights(arrays, pose, np.zeros(count), np.ones(count)),
-        np.asarray(arrays.trusted).astype(np.float64),
-        np.zeros((count, 2)),
-        np.zeros((count, 3, 3)),
-        np.zeros((count, 3)),
-        np.zeros((count, 3)),
-    )
-    return start.take(np.array(sorted(range(count), key=lambda k: arrays.ids[k]), np.int64))
-
-
 def search_coarse_poses(
     arrays: ObservationArrays, home: Ints, config: PoseSolverConfig = DEFAULT_ALIGN
 ) -> PoseSolution:
@@ -195,7 +99,8 @@ def search_coarse_poses(
     state = _select_home(make_initial_solution(arrays), arrays, home)
     rows = _rows_in(arrays, state)
     keep = limit_per_cell(arrays, np.asarray(arrays.pose), config.max_observations_per_cell)
-    return _apply_search(state, search_coarse(arrays, keep, rows, config.coarse_search))
+    found = search_coarse(arrays, keep, rows, config.coarse_search)
+    return replace(state, initial_pose=found, pose=found)
 
 
 def run_step(
@@ -206,19 +111,19 @@ def run_step(
     config: PoseSolverConfig = DEFAULT_ALIGN,
     keep: NDArray[np.bool_] | None = None,
 ) -> PoseSolution:
-    """Run one more step for the home observations; ids ascending.
+    """Run the local part of one more step for the home observations; ids ascending.
 
-    state: all observations of the arrays after the previous step. keep: (P,) points that count in a sweep,
+    state: all observations of the arrays after the previous step. keep: (P,) points that count in a joint step,
     :func:`limit_per_cell` at the initial poses of the state; None: computed here.
     """
     step = config.schedule[number]
-    if step.gate_and_kernel_m is None:
+    if step.joint is None:
         return _repeat_search(arrays, state, home, config)
     if keep is None:
         keep = limit_per_cell(
             arrays, state.initial_pose[state.row_indices(arrays.ids)], config.max_observations_per_cell
         )
-    return _sweep(arrays, state, np.flatnonzero(keep), (*step.gate_and_kernel_m, step.point_stride), home, config)
+    return _sum_home_pairs(arrays, state, np.flatnonzero(keep), step.joint, home, config)
 
 
 def _repeat_search(
@@ -226,13 +131,12 @@ def _repeat_search(
 ) -> PoseSolution:
     """Reset the home observations to their prior poses and search again among inlier agents alone."""
     initial = _select_home(make_initial_solution(arrays), arrays, home)
-    initial = replace(
-        initial,
-        agent_weight=np.where(_select_home(state, arrays, home).agent_weight > REJECTED_WEIGHT, 1.0, REJECTED_WEIGHT),
-    )
+    is_inlier = state.agent_weight > REJECTED_WEIGHT
     keep = limit_per_cell(arrays, np.asarray(arrays.pose), config.max_observations_per_cell)
-    keep &= (state.agent_weight[state.row_indices(arrays.ids)] > REJECTED_WEIGHT)[arrays.observation_of_point]
-    return _apply_search(initial, search_coarse(arrays, keep, _rows_in(arrays, initial), config.coarse_search))
+    keep &= is_inlier[state.row_indices(arrays.ids)][arrays.observation_of_point]
+    found = search_coarse(arrays, keep, _rows_in(arrays, initial), config.coarse_search)
+    agent_weight = np.where(is_inlier[state.row_indices(initial.ids)], 1.0, REJECTED_WEIGHT)
+    return replace(initial, initial_pose=found, pose=found, agent_weight=agent_weight)
 
 
 def _select_home(state: PoseSolution, arrays: ObservationArrays, home: Ints) -> PoseSolution:
@@ -246,127 +150,142 @@ def _rows_in(arrays: ObservationArrays, state: PoseSolution) -> Ints:
     return np.array([place[name] for name in state.ids], np.int64)
 
 
-def _apply_search(state: PoseSolution, found_pose: Floats) -> PoseSolution:
-    """Move a state from the prior poses to those of the coarse search."""
-    unmoved = (found_pose == state.pose).all(1)
-    shift = (found_pose - state.pose)[:, :2]
-    return replace(
-        state,
-        initial_pose=found_pose,
-        pose=found_pose,
-        gauge_weight=np.where(unmoved, state.gauge_weight, 0.0),
-        search_shift=shift,
-    )
-
-
-def _sweep(
+def _sum_home_pairs(
     arrays: ObservationArrays,
     state: PoseSolution,
     keep: Ints,
-    gate_kernel_stride: tuple[float, float, int],
+    widths: JointIteration,
     home: Ints,
     config: PoseSolverConfig,
 ) -> PoseSolution:
-    """Run one sweep for the home observations with this gate, kernel and stride among the points ``keep``."""
-    gate, kernel, stride = gate_kernel_stride
+    """Sum the pairs of the home observations at the poses of the state, among the points ``keep``."""
+    part = _select_home(state, arrays, home)
     rows = state.row_indices(arrays.ids)
-    start, prior_mean, pose = state.initial_pose[rows], state.prior_mean[rows], state.pose[rows]
+    pose = np.ascontiguousarray(state.pose[rows])
     xy, tangent = arrays.to_world(pose)
-    weight = compute_observation_weights(arrays, start, state.scale[rows], state.agent_weight[rows])
-    grid = build_grid(xy[keep, 0], xy[keep, 1], arrays.kind_of_point[keep], _SWEEP_CELL_M)
+    weight = np.where(state.agent_weight[rows] > REJECTED_WEIGHT, 1.0, 0.0)
+    weight[np.asarray(arrays.trusted)] = config.surveyed_weight
+    grid = build_grid(xy[keep, 0], xy[keep, 1], arrays.kind_of_point[keep], _PAIR_CELL_M)
     order = keep[grid.order]
-    far = np.asarray(arrays.observation_of_point)[order]
-    sums = build_normal_equations(
-        home,
-        (arrays.observation_offsets, xy, tangent, arrays.kind_of_point, arrays.sigma),
-        (grid.cell_m, grid.keys, grid.offsets, xy[order], tangent[order], far, weight[far]),
-        (
-            gate,
-            kernel,
+    own, offsets, other, shared = sum_pairs(
+        _rows_in(arrays, part),
+        pose,
+        weight,
+        OwnPoints(arrays.observation_offsets, xy, tangent, np.asarray(arrays.kind_of_point), np.asarray(arrays.sigma)),
+        OtherPoints(
+            grid.cell_m,
+            grid.keys,
+            grid.offsets,
+            xy[order],
+            tangent[order],
+            np.asarray(arrays.observation_of_point)[order],
+        ),
+        PairLimits(
+            widths.gate_m,
+            widths.kernel_m,
             config.max_longitudinal_m,
-            np.cos(config.max_heading_rad),
+            float(np.cos(config.max_heading_rad)),
             config.sigma_m,
             config.points_per_independent,
+            widths.point_stride,
         ),
-        stride,
     )
-    columns = step_poses(arrays, home, (start, prior_mean, pose), sums, config)
-    part = state.take(rows[home])
-    part = replace(part, **columns)
-    return part.take(np.array(sorted(range(len(part.ids)), key=lambda k: part.ids[k]), np.int64))
+    return replace(part, pairs=PairSums(own, offsets, arrays.digests[other], shared))
 
 
 def merge_solutions(
     parts: Sequence[PoseSolution], config: PoseSolverConfig = DEFAULT_ALIGN, number: int | None = None
 ) -> PoseSolution:
-    """Merge the home observations of all tiles after a step (None: the first search), ids ascending.
-
-    After a sweep, update each agent's residual scale and weight. After the rejection passes, also update each drive's bias.
-    """
-    ids = [name for part in parts for name in part.ids]
-    agents = [name for part in parts for name in part.agents]
-    drives = [name for part in parts for name in part.drives]
-    order = np.array(sorted(range(len(ids)), key=lambda k: ids[k]), np.int64)
-    whole = PoseSolution(
-        tuple(ids[k] for k in order.tolist()),
-        tuple(agents[k] for k in order.tolist()),
-        tuple(drives[k] for k in order.tolist()),
-        *(np.concatenate([getattr(part, name) for part in parts])[order] for name in _COLUMNS),
-    )
+    """Merge the home observations of all tiles after a step (None: the first search), ids ascending; solve a joint step."""
+    whole = PoseSolution.cat(parts)
     step = None if number is None else config.schedule[number]
-    if step is None or step.gate_and_kernel_m is None:
-        return whole
-    names, agent = np.unique(np.array(whole.agents), return_inverse=True)
-    residual = np.bincount(agent, whole.residual, len(names))
-    matched = np.bincount(agent, whole.num_matched, len(names))
-    # A prior of 20 points keeps the scale of an agent without matches at 0.2 m.
-    variance = (residual + 20.0 * 0.04) / (matched + 20.0)
-    prior_covariance = whole.prior_covariance[:, :2, :2]
-    observability = compute_observability(whole.covariance, prior_covariance)
-    mean_variance = np.trace(prior_covariance, axis1=1, axis2=2) / 2
-    gauge = (config.gauge_radius_m, config.rejection_gauge_scale if step.is_rejection_pass else config.gauge_scale)
-    common = estimate_gauge_offset(
-        (whole.initial_pose, whole.pose), observability, whole.gauge_weight * whole.agent_weight, mean_variance, gauge
+    if step is None or step.joint is None or whole.pairs is None or not len(whole.ids):
+        return replace(whole, pairs=None)
+    blocks = _assemble_blocks(whole.pairs, whole.ids)
+    priors = _make_priors(whole, config)
+    solved = solve_joint_step(blocks, priors, step.joint.prior_scale)
+    state = replace(_apply_step(whole, blocks, priors, solved, config), scale=_estimate_scale(whole, whole.pairs))
+    state = _weigh_agents(state, blocks.own, step.decides, config)
+    if step.is_last:
+        marginal = compute_marginal_covariance(solved.factor, len(whole.ids))
+        marginal[priors.fixed] = whole.prior_covariance[priors.fixed]
+        state = replace(state, common_covariance=marginal - state.covariance)
+    return state
+
+
+def _assemble_blocks(pairs: PairSums, ids: Sequence[str]) -> PairBlocks:
+    """Assemble the sums of all observations, whose ids ascend."""
+    # Fixed lengths compare as integers do; ids ascend, so rows are found by bisection.
+    digests = np.ascontiguousarray(pairs.other_ids).view("S16").ravel()
+    b = np.searchsorted(np.frombuffer(bytes.fromhex("".join(ids)), "S16"), digests)
+    own, right_side = pairs.own[:, _SYMMETRIC].reshape(-1, 3, 3), pairs.own[:, 6:9].copy()
+    np.add.at(own, b, pairs.shared[:, 9:15][:, _SYMMETRIC].reshape(-1, 3, 3))
+    np.add.at(right_side, b, pairs.shared[:, 15:18])
+    a = np.repeat(np.arange(len(ids)), np.diff(pairs.offsets))
+    return PairBlocks(own, right_side, a, b, pairs.shared[:, :9].reshape(-1, 3, 3))
+
+
+def _make_priors(whole: PoseSolution, config: PoseSolverConfig) -> JointPriors:
+    """Gather the priors of all observations and drives at the current poses."""
+    chain = make_drive_chain(
+        whole.drives, whole.time_ns, whole.prior_pose[:, :2], config.drift_length_m, config.max_drive_gap_m
     )
-    offset = (whole.pose - whole.initial_pose)[:, :2] - common
-    pose = whole.pose.copy()
-    pose[:, :2] -= np.where(whole.is_surveyed[:, None] > 0, 0.0, common)
-    limits = (
-        config.agent_scale,
-        config.rejection_agent_scale if step.is_rejection_pass else np.inf,
-        config.drive_correlation,
+    bias = np.empty_like(whole.drive_bias)
+    bias[chain.state] = whole.drive_bias
+    return JointPriors(
+        whole.correction,
+        whole.prior_covariance,
+        bias,
+        whole.is_surveyed > 0,
+        whole.agent_weight,
+        chain,
+        config.drive_fraction,
     )
-    agent_weight = estimate_agent_weights(offset + whole.search_shift, observability, mean_variance, agent, limits)
-    # An agent that a rejection pass rejected stays rejected until the next one ends.
-    stays_rejected = (whole.agent_weight <= REJECTED_WEIGHT) & (not step.reinstates)
-    agent_weight = np.where(whole.is_surveyed > 0, 1.0, np.where(stays_rejected, REJECTED_WEIGHT, agent_weight))
-    prior_mean = whole.prior_mean if step.is_rejection_pass else _estimate_prior_mean(whole, common, config)
+
+
+def _apply_step(
+    whole: PoseSolution, blocks: PairBlocks, priors: JointPriors, solved: JointStep, config: PoseSolverConfig
+) -> PoseSolution:
+    """Move the poses by a bounded step; their covariance given all other unknowns."""
+    limit = np.array([config.max_step_m, config.max_step_m, config.max_step_rad])
+    increment = np.where(priors.fixed[:, None], 0.0, np.clip(solved.increment, -limit, limit))
+    own_prior = np.linalg.inv((1.0 - config.drive_fraction) * whole.prior_covariance)
+    covariance = np.linalg.inv(blocks.own + solved.look_weight[:, None, None] * own_prior)
+    covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
     return replace(
         whole,
-        pose=pose,
-        relative_offset=offset,
-        scale=np.sqrt(variance)[agent],
-        agent_weight=agent_weight,
-        prior_mean=prior_mean,
+        pose=whole.pose + increment,
+        covariance=np.where(priors.fixed[:, None, None], whole.prior_covariance, covariance),
+        drive_bias=solved.bias[priors.chain.state],
+        look_weight=solved.look_weight,
+        pairs=None,
     )
 
 
-def _estimate_prior_mean(whole: PoseSolution, common: Floats, config: PoseSolverConfig) -> Floats:
-    """Estimate the mode of the prior (O, 3), relative to initial_pose, from the bias of each drive."""
-    drive = np.unique(np.array(whole.drives), return_inverse=True)[1]
-    from_claim = np.zeros((len(drive), 3))
-    from_claim[:, :2] = whole.search_shift - common
-    information_vector = whole.information_vector + np.einsum("oij,oj->oi", whole.information_matrix, from_claim)
-    prior_mean = estimate_drive_bias(
-        whole.information_matrix,
-        information_vector,
-        whole.prior_covariance,
-        drive,
-        config.drive_correlation,
-        config.drive_scale,
+def _estimate_scale(whole: PoseSolution, pairs: PairSums) -> Floats:
+    """Estimate the residual scale (O,) of each observation's agent in metres."""
+    agent = np.unique(np.array(whole.agents), return_inverse=True)[1]
+    # A prior of 20 points keeps the scale of an agent without matches at 0.2 m.
+    variance = (np.bincount(agent, pairs.own[:, 9]) + 20.0 * 0.04) / (np.bincount(agent, pairs.own[:, 10]) + 20.0)
+    return np.sqrt(variance)[agent]
+
+
+def _weigh_agents(state: PoseSolution, information: Floats, decides: bool, config: PoseSolverConfig) -> PoseSolution:
+    """Update the weights of agents, whose lines give information (O, 3, 3); only a step that decides rejects or reinstates."""
+    agent = np.unique(np.array(state.agents), return_inverse=True)[1]
+    prior = np.linalg.inv(state.prior_covariance)
+    ratio = (np.linalg.inv(information + prior) @ prior)[:, :2, :2]
+    variance = np.trace(state.prior_covariance[:, :2, :2], axis1=1, axis2=2) / 2
+    weight = estimate_agent_weights(
+        state.correction[:, :2],
+        np.eye(2) - (ratio + ratio.transpose(0, 2, 1)) / 2,
+        variance + config.observation_error_m**2,
+        agent,
+        (config.agent_scale, config.max_agent_error if decides else np.inf, config.drive_fraction),
     )
-    prior_mean[:, :2] -= whole.search_shift
-    return np.where(whole.is_surveyed[:, None] > 0, 0.0, prior_mean)
+    stays_rejected = (state.agent_weight <= REJECTED_WEIGHT) & (not decides)
+    weight = np.where(stays_rejected, REJECTED_WEIGHT, weight)
+    return replace(state, agent_weight=np.where(state.is_surveyed > 0, 1.0, weight))
 
 
 def limit_per_cell(arrays: ObservationArrays, pose: Floats, max_observations: int) -> NDArray[np.bool_]:

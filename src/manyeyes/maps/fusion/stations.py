@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 from manyeyes._jit import Boolx1, F64x2, I64x1, njit
 from manyeyes.datatypes.map_element import STYLES, take_rows
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED
-from manyeyes.maps.fusion.agent_weights import REJECTED_WEIGHT, compute_observation_weights
 from manyeyes.maps.fusion.coverage import find_observed_cells, merge_runs
 from manyeyes.maps.fusion.crossings import CrossingConfig, FusedCrossings, fuse_crossings
 from manyeyes.maps.fusion.existence import EvidenceConfig, EvidenceTable, accumulate_evidence, find_covered_by_inliers
 from manyeyes.maps.fusion.mean_shift import RidgeConfig, mean_shift_to_ridges, thin_ridges
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays, is_line
+from manyeyes.maps.fusion.observation_weights import compute_observation_weights
 from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, find_cell_range
-from manyeyes.maps.fusion.pose_optimization import PoseSolution, limit_per_cell
+from manyeyes.maps.fusion.pose_optimization import limit_per_cell
+from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT, PoseSolution
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -27,7 +27,8 @@ from manyeyes.maps.elements.observation import MapFrame
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.fusion.fuse import MapFusionConfig, assemble_map
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays, to_observation_arrays
-from manyeyes.maps.fusion.pose_optimization import PoseSolution, merge_solutions, run_step, search_coarse_poses
+from manyeyes.maps.fusion.pose_optimization import merge_solutions, run_step, search_coarse_poses
+from manyeyes.maps.fusion.pose_solution import PoseSolution
 from manyeyes.maps.fusion.stations import Area, StationTable, build_stations
 from manyeyes.maps.isolation import CONTENT_ERRORS, FailedObservation, FailedObservationsError, isolate_failures
 from manyeyes.maps.store.executors import Executor, ExecutorSession, ProcessExecutor, map_blocks

@@ -1,0 +1,282 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joint least squares over the poses of all observations and the errors of all drives: one robust Gauss-Newton step.
+
+The prior pose of observation o of drive d is off by b_do + e_o. The bias b of a drive starts from N(0, rho P) and drifts as a
+random
+walk over the distance driven; e is independent and has (1 - rho) P. Pairs of points (:mod:`manyeyes.maps.fusion.pair_system`)
+couple
+the poses of different observations. All of it is one sparse linear system a step, solved directly. Each e and the first bias
+of each
+drive have a Geman-McClure weight, so that one bad observation, or one bad drive, releases its own prior and no other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csc_array
+from scipy.sparse.linalg import SuperLU, splu
+
+from manyeyes._jit import F64x1, F64x3, I64x1, njit
+from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class DriveChain:
+    """States of the biases of drives: the state (O,) of each observation; of each state (S,) the state before it, -1 at the
+    start of a drive, and the variance ratio (S,) of the step from there, in units of the bias's prior variance.
+    """
+
+    state: Ints
+    previous: Ints
+    step_ratio: Floats
+
+    @property
+    def start(self) -> Ints:
+        """The first state (S,) of the drive of each state."""
+        first = np.arange(len(self.previous))
+        for k in np.flatnonzero(self.previous >= 0).tolist():
+            first[k] = first[self.previous[k]]
+        return first
+
+
+def make_drive_chain(
+    drives: tuple[str, ...], time_ns: Ints, xy: Floats, drift_length_m: float, max_gap_m: float
+) -> DriveChain:
+    """Make one state an observation, in order of time along each drive; a gap beyond max_gap_m starts another drive."""
+    name = np.unique(np.array(drives), return_inverse=True)[1]
+    order = np.lexsort((np.arange(len(name)), time_ns, name))
+    previous, ratio = np.full(len(name), -1), np.zeros(len(name))
+    state = np.empty(len(name), np.int64)
+    state[order] = np.arange(len(name))
+    if len(order) > 1:
+        gap = np.hypot(*(xy[order[1:]] - xy[order[:-1]]).T)
+        linked = (name[order[1:]] == name[order[:-1]]) & (gap <= max_gap_m)
+        previous[1:] = np.where(linked, np.arange(len(name) - 1), -1)
+        ratio[1:] = np.where(linked, np.maximum(gap, 1.0) / drift_length_m, 0.0)
+    return DriveChain(state, previous, ratio)
+
+
+@dataclass(frozen=True, eq=False)
+class PairBlocks:
+    """Sums of all pairs over O observations: own (O, 3, 3) and right side (O, 3), and N couplings between rows a and b, each block
+    (N, 3, 3) standing at (a, b) and transposed at (b, a).
+    """
+
+    own: Floats
+    right_side: Floats
+    a: Ints
+    b: Ints
+    coupling: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class JointPriors:
+    """Priors of O observations and S states: correction of the prior pose (O, 3), covariance (O, 3, 3) of the prior, biases (S, 3),
+    fixed (O,) poses, agent weights (O,), and the chain. bias_fraction: rho.
+    """
+
+    correction: Floats
+    covariance: Floats
+    bias: Floats
+    fixed: NDArray[np.bool_]
+    agent_weight: Floats
+    chain: DriveChain
+    bias_fraction: float
+
+
+@dataclass(frozen=True, eq=False)
+class JointStep:
+    """Result of one step: increments of the poses (O, 3), biases (S, 3), the weights of the priors of observations (O,) and of the
+    drives of the states (S,), and the factorized system.
+    """
+
+    increment: Floats
+    bias: Floats
+    look_weight: Floats
+    drive_weight: Floats
+    factor: SuperLU
+
+
+def compute_prior_weights(priors: JointPriors, scale: float) -> tuple[Floats, Floats]:
+    """Compute the Geman-McClure weights of each observation's own error (O,) and of each state's drive (S,); scale in sigmas."""
+    own = np.linalg.inv((1.0 - priors.bias_fraction) * priors.covariance)
+    error = priors.correction - priors.bias[priors.chain.state]
+    look = np.einsum("oi,oij,oj->o", error, own, error)
+    shared = _state_information(priors)
+    start = priors.chain.start
+    bias = priors.bias[start]
+    drive = np.einsum("si,sij,sj->s", bias, shared[start], bias)
+    return _geman_mcclure(look, scale), _geman_mcclure(drive, scale)
+
+
+def _geman_mcclure(square: Floats, scale: float) -> Floats:
+    return (scale**2 / (scale**2 + square)) ** 2
+
+
+def _state_information(priors: JointPriors) -> Floats:
+    """Return (S, 3, 3) inverse of the prior covariance of each state's bias."""
+    count = len(priors.chain.previous)
+    covariance, number = np.zeros((count, 3, 3)), np.zeros(count)
+    np.add.at(covariance, priors.chain.state, priors.covariance)
+    np.add.at(number, priors.chain.state, 1.0)
+    return np.asarray(np.linalg.inv(priors.bias_fraction * covariance / number[:, None, None]), np.float64)
+
+
+def solve_joint_step(pairs: PairBlocks, priors: JointPriors, scale: float) -> JointStep:
+    """Solve one Gauss-Newton step of all poses and biases together; scale: of the priors' Geman-McClure weights, in sigmas."""
+    look_weight, drive_weight = compute_prior_weights(priors, scale)
+    system, right_side = assemble_joint_system(pairs, priors, look_weight, drive_weight)
+    factor = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    found = factor.solve(right_side)
+    count = 3 * len(priors.correction)
+    return JointStep(found[:count].reshape(-1, 3), found[count:].reshape(-1, 3), look_weight, drive_weight, factor)
+
+
+def assemble_joint_system(
+    pairs: PairBlocks, priors: JointPriors, look_weight: Floats, drive_weight: Floats
+) -> tuple[csc_array, Floats]:
+    """Assemble the normal equations: the increments of O poses first, then S biases, three unknowns each."""
+    chain, count, states = priors.chain, len(priors.correction), len(priors.chain.previous)
+    rows, state = np.arange(count), count + chain.state
+    own_information = np.linalg.inv((1.0 - priors.bias_fraction) * priors.covariance)
+    own = (look_weight * priors.agent_weight)[:, None, None] * own_information
+    shared = _state_information(priors)
+    at = count + np.arange(states)
+    linked = chain.previous >= 0
+    start = np.where(linked, 0.0, drive_weight)[:, None, None] * shared
+    step = shared[linked] / chain.step_ratio[linked, None, None]
+    before, after = count + chain.previous[linked], at[linked]
+    hold = np.where(priors.fixed, 1e12, 0.0)[:, None, None] * np.eye(3)
+    # Row, column and sign of each family of blocks.
+    families = [
+        (rows, rows, pairs.own + own + hold), (pairs.a, pairs.b, pairs.coupling),
+        (pairs.b, pairs.a, pairs.coupling.transpose(0, 2, 1)),
+        (rows, state, -own), (state, rows, -own), (state, state, own),
+        (at, at, start), (after, after, step), (before, before, step), (before, after, -step), (after, before, -step),
+    ]  # fmt: skip
+    system = bsr_from_blocks(families, count + states)
+    pull = np.einsum("oij,oj->oi", own, priors.correction)
+    right_side = np.zeros((count + states, 3))
+    right_side[:count] = np.where(priors.fixed[:, None], 0.0, pairs.right_side - pull)
+    np.add.at(right_side, state, pull)
+    return system, right_side.reshape(-1)
+
+
+def bsr_from_blocks(families: list[tuple[Ints, Ints, Floats]], size: int) -> csc_array:
+    """Sum blocks (N, 3, 3) at block rows and columns (N,) into a sparse matrix of 3 size rows."""
+    row = np.concatenate([f[0] for f in families])
+    column = np.concatenate([f[1] for f in families])
+    block = np.concatenate([f[2] for f in families])
+    three = np.arange(3)
+    i = np.broadcast_to(3 * row[:, None, None] + three[:, None], block.shape)
+    j = np.broadcast_to(3 * column[:, None, None] + three[None, :], block.shape)
+    return coo_array((block.ravel(), (i.ravel(), j.ravel())), shape=(3 * size, 3 * size)).tocsc()
+
+
+def compute_marginal_covariance(factor: SuperLU, count: int) -> Floats:
+    """Compute the diagonal blocks (count, 3, 3) of the inverse of a symmetric system from its factors, of the first unknowns.
+
+    The inverse is computed on the pattern of the factor alone (Takahashi, Fagan and Chin, 1973; Erisman and Tinney, 1975).
+    """
+    lower = factor.L.tocsc()
+    lower.sort_indices()
+    values = _invert_on_pattern(
+        lower.indptr.astype(np.int64), lower.indices.astype(np.int64), lower.data, factor.U.diagonal()
+    )
+    # Row perm_r[i] of the factor is row i of the system; columns go alike in symmetric mode.
+    place = np.asarray(factor.perm_r, np.int64)
+    out = np.empty((count, 3, 3))
+    _gather_blocks(place, lower.indptr.astype(np.int64), lower.indices.astype(np.int64), values, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _invert_on_pattern(
+    offsets: I64x1, rows: I64x1, lower: F64x1, diagonal: F64x1
+) -> F64x1:  # pragma: no cover - compiled
+    """Compute the inverse of L D L' at the entries of L (unit lower, sorted columns with the diagonal first)."""
+    out, size = np.zeros(len(lower)), len(diagonal)
+    place, total = np.full(size, -1), np.zeros(size)
+    for j in range(size - 1, -1, -1):
+        a, b = offsets[j] + 1, offsets[j + 1]
+        for k in range(a, b):
+            place[rows[k]] = k
+            total[rows[k]] = 0.0
+        for k in range(a, b):
+            r, f = rows[k], lower[k]
+            # Column r of the inverse holds the entries (i, r) with i >= r; each serves (i, r) and (r, i).
+            total[r] += out[offsets[r]] * f
+            for m in range(offsets[r] + 1, offsets[r + 1]):
+                i = rows[m]
+                if place[i] >= 0:
+                    total[i] += out[m] * f
+                    total[r] += out[m] * lower[place[i]]
+        own = 1.0 / diagonal[j]
+        for k in range(a, b):
+            out[k] = -total[rows[k]]
+            own -= lower[k] * out[k]
+        out[offsets[j]] = own
+        for k in range(a, b):
+            place[rows[k]] = -1
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _gather_blocks(
+    place: I64x1, offsets: I64x1, rows: I64x1, values: F64x1, out: F64x3
+) -> None:  # pragma: no cover - compiled
+    """Gather the blocks (N, 3, 3) on the diagonal; place: row of the factor of each unknown."""
+    for o in range(len(out)):
+        for i in range(3):
+            for j in range(3):
+                one, two = place[3 * o + i], place[3 * o + j]
+                low, high = min(one, two), max(one, two)
+                out[o, i, j] = 0.0
+                for k in range(offsets[low], offsets[low + 1]):
+                    if rows[k] == high:
+                        out[o, i, j] = values[k]
+                        break
+
+
+def estimate_agent_weights(
+    offset: Floats, observability: Floats, prior_variance: Floats, agent: Ints, limits: tuple[float, float, float]
+) -> Floats:
+    """Estimate agent weights (O,) in (0, 1] from the mean correction of each agent's prior poses (robust M-estimation).
+
+    The mean over an agent's observations is used because independent noise averages out, while a bias or an attack does not.
+    Only observable directions count.
+
+    Args:
+        offset: (O, 2) metres, correction of each observation relative to those nearby.
+        observability: (O, 2, 2), see :func:`compute_observability`.
+        prior_variance: (O,) m², mean variance of the prior position.
+        agent: (O,) agent of each observation, from 0.
+        limits: Geman-McClure scale and rejection limit, both in standard deviations; fraction of the prior variance that is
+            common to a drive.
+    """
+    count = int(agent.max(initial=-1)) + 1
+    scale, limit, drive_correlation = limits
+    weight, pull, prior_sum, num_observations = (
+        np.zeros((count, 2, 2)),
+        np.zeros((count, 2)),
+        np.zeros(count),
+        np.zeros(count),
+    )
+    np.add.at(weight, agent, observability)
+    np.add.at(pull, agent, np.einsum("oij,oj->oi", observability, offset))
+    np.add.at(prior_sum, agent, prior_variance)
+    np.add.at(num_observations, agent, 1.0)
+    mean = np.linalg.solve(weight + 0.1 * np.eye(2), pull[:, :, None])[:, :, 0]
+    spread = (
+        prior_sum
+        / num_observations
+        * (1.0 + drive_correlation * (np.trace(weight, axis1=1, axis2=2) / 2 - 1.0).clip(0.0))
+    )
+    distance = np.einsum("ai,aij,aj->a", mean, weight, mean).clip(0.0) / np.maximum(spread, 1e-12)
+    return np.where(distance > limit**2, REJECTED_WEIGHT, (scale**2 / (scale**2 + distance)) ** 2)[agent]

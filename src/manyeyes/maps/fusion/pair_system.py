@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Couple the poses of overlapping observations by the lines that they share, with the stations of the lines eliminated.
+
+A station s on a line that n observations detect has the residuals e_i = u'(T_i p_i) - u's, weighted by w_i, along the normal u of
+the line. Eliminating s (Schur complement) leaves sum_i w_i (e_i - mean)^2 = 1/2 sum_ij w_i w_j / sum_k w_k (e_i - e_j)^2, a
+sum over
+pairs of observations (Triggs et al., Bundle Adjustment, 1999, section 6). Here the members of the station of point p are the
+points
+q of other observations around it, each with the weight of a redescending kernel (Geman-McClure) and of its longitudinal
+distance, so
+that no association is hard. Residuals are lateral, along the mean normal of both lines, which has no bias on a bend.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes._jit import F64x1, F64x2, I64x1, njit
+from manyeyes.maps.fusion.point_grid import find_cell_range, line_residual
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+NUM_OWN, NUM_SHARED = 11, 18
+
+
+class OwnPoints(NamedTuple):
+    """Points of observations: offsets (O + 1,), positions and unit tangents (P, 2) in the map's frame, kinds and sigmas (P,)."""
+
+    offsets: I64x1
+    xy: F64x2
+    tangent: F64x2
+    kind: I64x1
+    sigma: F64x1
+
+
+class OtherPoints(NamedTuple):
+    """The same points in the order of a grid: cell (m), keys, offsets, positions, unit tangents (P, 2) and observations (P,)."""
+
+    cell_m: float
+    keys: I64x1
+    offsets: I64x1
+    xy: F64x2
+    tangent: F64x2
+    observation: I64x1
+
+
+class PairLimits(NamedTuple):
+    """Lateral gate (m), Geman-McClure kernel (m), longitudinal gate (m), cosine of the heading gate, sigma of a line (m), points of
+    one line that count as one, every how many points are used.
+    """
+
+    gate_m: float
+    kernel_m: float
+    max_longitudinal_m: float
+    min_cosine: float
+    sigma_m: float
+    points_per_independent: float
+    point_stride: int
+
+
+@njit(cache=True, nogil=True)
+def sum_pairs(
+    home: I64x1, pose: F64x2, weight: F64x1, own_points: OwnPoints, other_points: OtherPoints, limits: PairLimits
+) -> tuple[F64x2, I64x1, I64x1, F64x2]:  # pragma: no cover - compiled
+    """Sum the normal equations of all pairs of points of the home observations.
+
+    Returns own, offsets, the rows of the other observations, and shared; see
+    :class:`~manyeyes.maps.fusion.pose_solution.PairSums`.
+
+    pose: (O, 3) about whose positions the observations turn. weight: (O,) weight of each observation's lines; where it is 0
+        the lines
+    move the observation, and no other by it.
+    """
+    first, xy, sigma = own_points.offsets, own_points.xy, own_points.sigma
+    gate, reach, c2 = limits.gate_m, limits.max_longitudinal_m, limits.kernel_m**2
+    far = gate * gate + reach * reach
+    radius, stride = np.sqrt(far), limits.point_stride
+    own, offsets = np.zeros((len(home), NUM_OWN)), np.zeros(len(home) + 1, np.int64)
+    slot, met = np.full(len(pose), -1), np.empty(len(pose), np.int64)
+    sums = np.zeros((len(pose), NUM_SHARED))
+    other, shared, filled = np.empty(64, np.int64), np.empty((64, NUM_SHARED)), 0
+    near, gain = np.empty(256, np.int64), np.empty((256, 4))
+    for h in range(len(home)):
+        o, n = home[h], 0
+        for p in range(first[o], first[o + 1], stride):
+            found, total, gain, near = _find_members(
+                p, o, radius, c2, own_points, other_points, limits, weight, gain, near
+            )
+            if found == 0:
+                continue
+            mine = max(weight[o], 1e-9)
+            unit = stride / (limits.points_per_independent * (sigma[p] * sigma[p] + limits.sigma_m * limits.sigma_m))
+            x, y = xy[p, 0] - pose[o, 0], xy[p, 1] - pose[o, 1]
+            square = 0.0
+            for m in range(found):
+                q, w, r = near[m], gain[m, 0], gain[m, 1]
+                jx, jy = -gain[m, 3], gain[m, 2]
+                jt = jy * x - jx * y
+                j = other_points.observation[q]
+                # The other point's residual about the same station is the second half of the pair.
+                w = unit * w / (mine + total) * (0.5 * mine if weight[o] > 0.0 else 1.0)
+                _add_own(own[h], w, (jx, jy, jt), r)
+                square += gain[m, 0] * r * r
+                if weight[o] <= 0.0:
+                    continue
+                if slot[j] < 0:
+                    slot[j], met[n] = n, j
+                    sums[n] = 0.0
+                    n += 1
+                at = sums[slot[j]]
+                lx, ly = other_points.xy[q, 0] - pose[j, 0], other_points.xy[q, 1] - pose[j, 1]
+                lt = jy * lx - jx * ly
+                _add_shared(at, w, (jx, jy, jt), lt, r)
+            vote = total / (total + 0.5)
+            own[h, 9] += vote * square / total
+            own[h, 10] += vote
+        order = np.sort(met[:n])
+        while filled + n > len(other):
+            other, shared = _longer(other), _taller(shared)
+        for i in range(n):
+            other[filled], shared[filled] = order[i], sums[slot[order[i]]]
+            filled += 1
+        for i in range(n):
+            slot[met[i]] = -1
+        offsets[h + 1] = filled
+    return own, offsets, other[:filled].copy(), shared[:filled].copy()
+
+
+@njit(cache=True, nogil=True)
+def _add_own(
+    row: F64x1, w: float, jacobian: tuple[float, float, float], r: float
+) -> None:  # pragma: no cover - compiled
+    """Add a pair of weight w and residual r to the first 9 columns of own."""
+    jx, jy, jt = jacobian
+    row[0] += w * jx * jx
+    row[1] += w * jx * jy
+    row[2] += w * jx * jt
+    row[3] += w * jy * jy
+    row[4] += w * jy * jt
+    row[5] += w * jt * jt
+    row[6] += w * jx * r
+    row[7] += w * jy * r
+    row[8] += w * jt * r
+
+
+@njit(cache=True, nogil=True)
+def _add_shared(
+    row: F64x1, w: float, jacobian: tuple[float, float, float], lt: float, r: float
+) -> None:  # pragma: no cover - compiled
+    """Add a pair to the columns of shared; lt: derivative by the heading of the other observation."""
+    jx, jy, jt = jacobian
+    row[0] -= w * jx * jx
+    row[1] -= w * jx * jy
+    row[2] -= w * jx * lt
+    row[3] -= w * jy * jx
+    row[4] -= w * jy * jy
+    row[5] -= w * jy * lt
+    row[6] -= w * jt * jx
+    row[7] -= w * jt * jy
+    row[8] -= w * jt * lt
+    row[9] += w * jx * jx
+    row[10] += w * jx * jy
+    row[11] += w * jx * lt
+    row[12] += w * jy * jy
+    row[13] += w * jy * lt
+    row[14] += w * lt * lt
+    row[15] -= w * jx * r
+    row[16] -= w * jy * r
+    row[17] -= w * lt * r
+
+
+@njit(cache=True, nogil=True)
+def _find_members(
+    p: int,
+    o: int,
+    radius: float,
+    c2: float,
+    own_points: OwnPoints,
+    other_points: OtherPoints,
+    limits: PairLimits,
+    weight: F64x1,
+    gain: F64x2,
+    near: I64x1,
+) -> tuple[int, float, F64x2, I64x1]:  # pragma: no cover - compiled
+    """Find the members of the station of point p: their number, sum of weights, (weight, residual, mean tangent) and points."""
+    x, y = own_points.xy[p, 0], own_points.xy[p, 1]
+    u, v, kind = own_points.tangent[p, 0], own_points.tangent[p, 1], own_points.kind[p]
+    cell = other_points.cell_m
+    low_y, high_y = int(np.floor((y - radius) / cell)), int(np.floor((y + radius) / cell))
+    found, total = 0, 0.0
+    for ix in range(int(np.floor((x - radius) / cell)), int(np.floor((x + radius) / cell)) + 1):
+        low, high = find_cell_range(other_points.keys, other_points.offsets, kind, ix, low_y, high_y)
+        for q in range(low, high):
+            j = other_points.observation[q]
+            if j == o or weight[j] <= 0.0:
+                continue
+            ex, ey = other_points.xy[q, 0] - x, other_points.xy[q, 1] - y
+            if ex * ex + ey * ey > radius * radius:
+                continue
+            s, t = other_points.tangent[q, 0], other_points.tangent[q, 1]
+            along, aside = line_residual(ex, ey, u, v, s, t, limits.min_cosine)
+            if abs(along) > limits.max_longitudinal_m or abs(aside) > limits.gate_m:
+                continue
+            g = c2 / (c2 + aside * aside)
+            w = weight[j] * g * g * (1.0 - abs(along) / limits.max_longitudinal_m)
+            if w <= 0.0:
+                continue
+            if found == len(near):
+                near, gain = _longer(near), _taller(gain)
+            dot = u * s + v * t
+            sign = 1.0 if dot > 0.0 else -1.0
+            norm = np.sqrt(2.0 + 2.0 * abs(dot))
+            near[found] = q
+            gain[found, 0], gain[found, 1] = w, aside
+            gain[found, 2], gain[found, 3] = (u + sign * s) / norm, (v + sign * t) / norm
+            total += w
+            found += 1
+    return found, float(total), gain, near
+
+
+@njit(cache=True, nogil=True)
+def _longer(rows: I64x1) -> I64x1:  # pragma: no cover - compiled
+    bigger = np.empty(2 * len(rows), np.int64)
+    bigger[: len(rows)] = rows
+    return bigger
+
+
+@njit(cache=True, nogil=True)
+def _taller(rows: F64x2) -> F64x2:  # pragma: no cover - compiled
+    bigger = np.empty((2 * len(rows), rows.shape[1]))
+    bigger[: len(rows)] = rows
+    return bigger

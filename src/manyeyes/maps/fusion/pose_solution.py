@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The state of the pose optimization: corrected poses of a set of observations, and the sums of their pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from manyeyes.maps.fusion.observation_arrays import ObservationArrays
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+REJECTED_WEIGHT = 1e-6
+"""Weight of a rejected agent; not 0, so that elements seen by such an agent alone still get a position."""
+
+
+@dataclass(frozen=True, eq=False)
+class PairSums:
+    """Sums over the pairs of points of O observations, each with the N other observations that its points meet.
+
+    own: (O, 11) upper triangle (xx, xy, xt, yy, yt, tt) and right side (x, y, t) of the observation's own block, weighted sum of
+    squared residuals (m²), sum of votes of its points. offsets: (O + 1,) of the pairs. other_ids: (N, 16) observation of each pair.
+    shared: (N, 18) of each pair: block between both (3, 3), then upper triangle and right side of the other observation.
+    """
+
+    own: Floats
+    offsets: Ints
+    other_ids: NDArray[np.uint8]
+    shared: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSolution:
+    """Corrected poses of O observations, ids ascending.
+
+    ids: (O,) hexadecimal. agents, drives: (O,) names; a drive belongs to one agent. time_ns: (O,).
+    prior_pose: (O, 3) and prior_covariance: (O, 3, 3) of it. initial_pose: (O, 3) after the coarse search, the prior pose where it
+        found no shift.
+    pose: (O, 3). covariance: (O, 3, 3) of it given the poses of all other observations. common_covariance: (O, 3, 3) what
+        the marginal covariance adds, which observations nearby share.
+    drive_bias: (O, 3) metres, metres, radians, estimated bias of the drive's prior poses here.
+    scale: (O,) metres, robust residual scale of the agent's lines.
+    agent_weight: (O,) in (0, 1], see :func:`~manyeyes.maps.fusion.joint_solver.estimate_agent_weights`.
+    look_weight: (O,) in (0, 1], weight of the prior of the observation's own error.
+    is_surveyed: (O,) 1 for surveyed poles.
+    pairs: sums of a step before its parts are merged, else None.
+    """
+
+    ids: tuple[str, ...]
+    agents: tuple[str, ...]
+    drives: tuple[str, ...]
+    time_ns: Ints
+    prior_pose: Floats
+    prior_covariance: Floats
+    initial_pose: Floats
+    pose: Floats
+    covariance: Floats
+    common_covariance: Floats
+    drive_bias: Floats
+    scale: Floats
+    agent_weight: Floats
+    look_weight: Floats
+    is_surveyed: Floats
+    pairs: PairSums | None = field(default=None, kw_only=True)
+
+    @property
+    def correction(self) -> Floats:
+        """The corrections (O, 3) of the prior poses: metres, metres, radians within half a turn."""
+        moved = self.pose - self.prior_pose
+        moved[:, 2] = (moved[:, 2] + np.pi) % (2 * np.pi) - np.pi
+        return moved
+
+    def row_indices(self, ids: Sequence[str]) -> Ints:
+        """Return the rows of these ids."""
+        place = {name: k for k, name in enumerate(self.ids)}
+        return np.array([place[name] for name in ids], np.int64)
+
+    def take(self, rows: Ints) -> PoseSolution:
+        """Return the chosen rows without pairs, in the order given."""
+        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in _COLUMNS}
+        for name in ("ids", "agents", "drives"):
+            columns[name] = tuple(getattr(self, name)[k] for k in rows.tolist())
+        return PoseSolution(**columns)
+
+    @classmethod
+    def cat(cls, parts: Sequence[PoseSolution]) -> PoseSolution:
+        """Concatenate disjoint parts, ids ascending, with their pairs if all have them."""
+        columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS}
+        for name in ("ids", "agents", "drives"):
+            columns[name] = tuple(text for part in parts for text in getattr(part, name))
+        joined = cls(**columns)
+        order = np.array(sorted(range(len(joined.ids)), key=lambda k: joined.ids[k]), np.int64)
+        sums = [part.pairs for part in parts if part.pairs is not None]
+        pairs = _concatenate_pairs(sums, order) if len(sums) == len(parts) else None
+        return replace(joined.take(order), pairs=pairs)
+
+
+_COLUMNS = (
+    "time_ns",
+    "prior_pose",
+    "prior_covariance",
+    "initial_pose",
+    "pose",
+    "covariance",
+    "common_covariance",
+    "drive_bias",
+    "scale",
+    "agent_weight",
+    "look_weight",
+    "is_surveyed",
+)
+
+
+def _concatenate_pairs(parts: Sequence[PairSums], order: Ints) -> PairSums:
+    """Concatenate the pairs of parts, then take the observations in an order."""
+    sizes = np.concatenate([np.diff(part.offsets) for part in parts])
+    starts = np.concatenate(([0], np.cumsum(sizes)))[:-1][order]
+    sizes = sizes[order]
+    offsets = np.concatenate(([0], np.cumsum(sizes))).astype(np.int64)
+    places = np.arange(offsets[-1]) + np.repeat(starts - offsets[:-1], sizes)
+    return PairSums(
+        np.concatenate([part.own for part in parts])[order],
+        offsets,
+        np.concatenate([part.other_ids for part in parts])[places],
+        np.concatenate([part.shared for part in parts])[places],
+    )
+
+
+def make_initial_solution(arrays: ObservationArrays) -> PoseSolution:
+    """Make the solution at the prior poses, ids ascending."""
+    count = len(arrays)
+    pose, covariance = np.array(arrays.pose), np.array(arrays.covariance)
+    start = PoseSolution(
+        ids=arrays.ids,
+        agents=tuple(arrays.agents[a] for a in arrays.agent.tolist()),
+        drives=arrays.drives,
+        time_ns=np.array(arrays.time_ns),
+        prior_pose=pose,
+        prior_covariance=covariance,
+        initial_pose=pose,
+        pose=pose,
+        covariance=covariance,
+        common_covariance=np.zeros((count, 3, 3)),
+        drive_bias=np.zeros((count, 3)),
+        scale=np.full(count, 0.2),
+        agent_weight=np.ones(count),
+        look_weight=np.ones(count),
+        is_surveyed=np.asarray(arrays.trusted).astype(np.float64),
+    )
+    return start.take(np.array(sorted(range(count), key=lambda k: arrays.ids[k]), np.int64))

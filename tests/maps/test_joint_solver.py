@@ -1,0 +1,248 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The joint step against slow dense twins: pairs by loops and numeric derivatives, stations as unknowns, the dense inverse."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from manyeyes.datatypes.map_element import BOUNDARY, DIVIDER, MapElements
+from manyeyes.maps.elements.observation import Observation
+from manyeyes.maps.fusion import pose_optimization
+from manyeyes.maps.fusion.joint_solver import (
+    assemble_joint_system,
+    compute_marginal_covariance,
+    compute_prior_weights,
+    estimate_agent_weights,
+    make_drive_chain,
+    solve_joint_step,
+)
+from manyeyes.maps.fusion.observation_arrays import to_observation_arrays
+from manyeyes.maps.fusion.pose_config import JointIteration, PoseSolverConfig
+from manyeyes.maps.fusion.pose_optimization import solve_poses
+from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT, make_initial_solution
+
+VIEW = np.array([[-20.0, -10.0], [20.0, -10.0], [20.0, 10.0], [-20.0, 10.0]])
+P = np.diag([0.16, 0.16, 1e-4])
+CONFIG = PoseSolverConfig()
+
+
+def make_observation(at, agent, number, error=(0.0, 0.0, 0.0), covariance=P, noise=0.05, turned=True):
+    """A road of two kinds of lines, and a line across it, seen from a true pose."""
+    rng = np.random.default_rng(number)
+    along = np.arange(-12.0, 12.5, 2.0)
+    lines = [np.stack((along, np.full(len(along), y - at[1])), 1) for y in (-3.5, 0.0, 3.5)]
+    lines += [np.stack((np.full(5, 5.0 - at[0]), np.linspace(-4.0, 4.0, 5) - at[1]), 1)] if turned else []
+    lines = [line + rng.normal(0.0, noise, line.shape) for line in lines]
+    kinds = [BOUNDARY, DIVIDER, DIVIDER, DIVIDER][: len(lines)]
+    return Observation(
+        agent, f"{agent}-1", 1_700_000_000_000_000_000 + number * 10**9, np.array(at) + error, covariance, VIEW,
+        MapElements.of(lines, kinds, 0.9),
+    )  # fmt: skip
+
+
+def make_problem(observations, widths, config=CONFIG):
+    """Pair blocks and priors at the prior poses, and the arrays in the order of the solution."""
+    arrays = to_observation_arrays(observations, config.spacing_m)
+    state = make_initial_solution(arrays)
+    keep = np.arange(len(arrays.xy))
+    part = pose_optimization._sum_home_pairs(arrays, state, keep, widths, np.arange(len(arrays)), config)
+    assert part.pairs is not None
+    blocks = pose_optimization._assemble_blocks(part.pairs, part.ids)
+    return arrays, state, blocks, pose_optimization._make_priors(state, config)
+
+
+def move(pose, step, point):
+    """A point of the map's frame after its observation moved by a step about its own position."""
+    c, s = np.cos(step[2]), np.sin(step[2])
+    d = point - pose[:2]
+    return pose[:2] + step[:2] + (c * d[0] - s * d[1], s * d[0] + c * d[1])
+
+
+def sum_pairs_slowly(arrays, pose, order, widths, config):
+    """Rows of a dense least squares, (weights, derivatives, residuals), of all ordered pairs of points."""
+    xy, tangent = arrays.to_world(pose)
+    owner, rows = np.asarray(arrays.observation_of_point), []
+    for p in range(len(xy)):
+        members = []
+        for q in range(len(xy)):
+            if owner[q] == owner[p] or arrays.kind_of_point[q] != arrays.kind_of_point[p]:
+                continue
+            cosine = tangent[p] @ tangent[q]
+            mean = tangent[p] + np.sign(cosine) * tangent[q]
+            mean = mean / np.linalg.norm(mean)
+            normal, away = np.array([-mean[1], mean[0]]), xy[q] - xy[p]
+            if (
+                abs(cosine) < np.cos(config.max_heading_rad)
+                or abs(away @ mean) > 1.0
+                or abs(away @ normal) > widths.gate_m
+            ):
+                continue
+            kernel = (widths.kernel_m**2 / (widths.kernel_m**2 + (away @ normal) ** 2)) ** 2
+            members.append((kernel * (1.0 - abs(away @ mean)), q, normal))
+        total = sum(k for k, _, _ in members)
+        unit = 1.0 / (config.points_per_independent * (arrays.sigma[p] ** 2 + config.sigma_m**2))
+        for k, q, normal in members:
+            derivative = np.zeros(3 * len(pose))
+
+            def residual(row, step, p=p, q=q, normal=normal):
+                steps = np.zeros((len(pose), 3))
+                steps[row] = step
+                one, two = (move(pose[owner[n]], steps[owner[n]], xy[n]) for n in (p, q))
+                return normal @ (two - one)
+
+            for o in (owner[p], owner[q]):
+                for axis in range(3):
+                    h = 1e-6 * np.eye(3)[axis]
+                    derivative[3 * order[o] + axis] = (residual(o, h) - residual(o, -h)) / 2e-6
+            rows.append((0.5 * unit * k / (1.0 + total), derivative, residual(owner[p], np.zeros(3))))
+    return rows
+
+
+@pytest.fixture(scope="module")
+def crossroads():
+    """Five observations of three drives with errors of poses."""
+    rng = np.random.default_rng(5)
+    names = ("a", "a", "b", "b", "c")
+    return [
+        make_observation((2.0 * k - 4.0, 0.5 * k - 1.0, 0.0), name, k, rng.normal(0.0, (0.3, 0.3, 0.01)))
+        for k, name in enumerate(names)
+    ]
+
+
+def test_a_step_equals_that_of_a_dense_least_squares(crossroads):
+    widths = JointIteration(2.0, 0.8, 4.0)
+    arrays, state, blocks, priors = make_problem(crossroads, widths)
+    bias = np.random.default_rng(2).normal(0.0, 0.1, (5, 3)) * (1.0, 1.0, 0.02)
+    priors = replace(priors, bias=bias, correction=0.5 * bias[priors.chain.state][::-1])
+    found = solve_joint_step(blocks, priors, 4.0)
+    order = state.row_indices(arrays.ids)
+    count, rows = len(arrays), []
+    for weight, derivative, residual in sum_pairs_slowly(arrays, np.asarray(arrays.pose), order, widths, CONFIG):
+        rows.append((weight, np.concatenate((derivative, np.zeros(3 * count))), residual))
+    look, drive = compute_prior_weights(priors, 4.0)
+    half = np.linalg.cholesky(np.linalg.inv(0.5 * P)).T
+    for o in range(count):
+        s = priors.chain.state[o]
+        for axis in range(3):
+            derivative = np.zeros(6 * count)
+            derivative[3 * o : 3 * o + 3] = half[axis]
+            derivative[3 * (count + s) : 3 * (count + s) + 3] = -half[axis]
+            rows.append((look[o], derivative, half[axis] @ priors.correction[o]))
+    for s in range(count):
+        before = priors.chain.previous[s]
+        for axis in range(3):
+            derivative = np.zeros(6 * count)
+            derivative[3 * (count + s) : 3 * (count + s) + 3] = half[axis]
+            if before >= 0:
+                derivative[3 * (count + before) : 3 * (count + before) + 3] = -half[axis]
+            rows.append((1.0 / priors.chain.step_ratio[s] if before >= 0 else drive[s], derivative, 0.0))
+    root = np.sqrt([w for w, _, _ in rows])
+    dense = np.linalg.lstsq(
+        root[:, None] * np.array([d for _, d, _ in rows]), -root * np.array([r for _, _, r in rows]), rcond=None
+    )[0]
+    np.testing.assert_allclose(found.increment, dense[: 3 * count].reshape(-1, 3), atol=1e-6)
+    np.testing.assert_allclose(found.bias, dense[3 * count :].reshape(-1, 3), atol=1e-6)
+    assert np.abs(found.increment[:, :2]).max() > 0.05
+
+
+def test_pairs_equal_stations_as_unknowns():
+    """Four observations see the same points of straight lines, so that every station has one point of each."""
+    shifts = (0.3, -0.2, 0.1, 0.4)
+    seen = [
+        make_observation((0.0, 0.0, 0.0), f"a{k}", k, (0.0, y, 0.0), noise=0.0, turned=False)
+        for k, y in enumerate(shifts)
+    ]
+    config = replace(CONFIG, max_longitudinal_m=0.4)
+    _, state, blocks, priors = make_problem(seen, JointIteration(2.0, 1e6, 1e6), config)
+    found = solve_joint_step(blocks, priors, 1e6)
+    # The same by hand: y of each pose, one unknown a station; all stations are alike, heading is determined and stays.
+    weight = 3 * 25 / (CONFIG.points_per_independent * (CONFIG.sigma_m**2 + float(seen[0].elements.sigma[0]) ** 2))
+    y = np.array([state.pose[k, 1] for k in range(4)])
+    design = np.vstack((np.hstack((np.eye(4), -np.ones((4, 1)))), np.hstack((np.eye(4), np.zeros((4, 1))))))
+    root = np.sqrt(np.repeat((weight, 1.0 / 0.16), 4))
+    right = -root * np.concatenate((y, np.zeros(4)))
+    dense = np.linalg.lstsq(root[:, None] * design, right, rcond=None)[0]
+    np.testing.assert_allclose(found.increment[:, 1], dense[:4], atol=1e-6)
+    np.testing.assert_allclose(found.increment[:, [0, 2]], 0.0, atol=1e-9)
+
+
+def test_marginal_covariance_equals_the_dense_inverse(crossroads):
+    _, _, blocks, priors = make_problem(crossroads, JointIteration(2.0, 0.8, 9.0))
+    system, _ = assemble_joint_system(blocks, priors, *compute_prior_weights(priors, 9.0))
+    dense = np.linalg.inv(system.toarray())
+    found = compute_marginal_covariance(solve_joint_step(blocks, priors, 9.0).factor, len(crossroads))
+    for o in range(len(crossroads)):
+        np.testing.assert_allclose(found[o], dense[3 * o : 3 * o + 3, 3 * o : 3 * o + 3], rtol=1e-8, atol=1e-14)
+
+
+def make_drives(sigma, covariance, bad=0.0):
+    """Six drives of four looks along one road; the second look of the first drive is off by ``bad`` across it."""
+    rng = np.random.default_rng(11)
+    common, own = rng.normal(0.0, 1.0, (6, 3)), rng.normal(0.0, 1.0, (6, 4, 3))
+    scale = np.sqrt(0.5) * sigma * np.array([1.0, 1.0, 0.02])
+    out = []
+    for d in range(6):
+        for k in range(4):
+            error = scale * (common[d] + own[d, k]) + (0.0, bad if (d, k) == (0, 1) else 0.0, 0.0)
+            at = (2.0 * k - 3.0, 0.3 * d - 1.0, 0.0)
+            out.append((at, make_observation(at, f"d{d}", 4 * d + k, error, covariance)))
+    return out
+
+
+def lateral_error(drives, skip=()):
+    solved = solve_poses([o for _, o in drives])
+    rows = solved.row_indices([o.id for _, o in drives])
+    away = np.abs(solved.pose[rows, 1] - [at[1] for at, _ in drives])
+    return np.delete(away, list(skip)), away
+
+
+def test_exact_priors_are_not_worse_than_bad_ones():
+    exact = lateral_error(make_drives(0.0, np.diag([0.05**2, 0.05**2, 1e-6])))[0]
+    assert np.sqrt(np.mean(exact**2)) <= np.sqrt(np.mean(lateral_error(make_drives(0.4, P))[0] ** 2))
+    assert exact.max() < 0.05
+
+
+@pytest.mark.parametrize("bad", [0.6, 1.0])
+def test_one_bad_observation_does_not_spoil_its_drive(bad):
+    covariance = np.diag([0.05**2, 0.05**2, 1e-6])
+    others, all_of_them = lateral_error(make_drives(0.0, covariance, bad), skip=(1,))
+    assert others.max() < 0.05 and all_of_them[1] < 0.1
+
+
+def test_drive_chain_follows_time_and_breaks_at_gaps():
+    xy = np.array([[100.0, 0.0], [0.0, 0.0], [50.0, 0.0], [900.0, 0.0], [0.0, 0.0]])
+    chain = make_drive_chain(("a", "a", "a", "a", "b"), np.array([3, 1, 2, 4, 1]), xy, 1000.0, 300.0)
+    assert chain.state.tolist() == [2, 0, 1, 3, 4]
+    assert chain.previous.tolist() == [-1, 0, 1, -1, -1] and chain.start.tolist() == [0, 0, 0, 3, 4]
+    assert chain.step_ratio == pytest.approx([0.0, 0.05, 0.05, 0.0, 0.0])
+
+
+def agent_weights(offset, agent, observability=1.0):
+    """Estimate the agent weight of each observation at this observability."""
+    count = len(agent)
+    matrix = np.tile(observability * np.eye(2), (count, 1, 1))
+    return estimate_agent_weights(np.array(offset), matrix, np.full(count, 0.16), np.array(agent), (2.0, 3.0, 0.5))
+
+
+def test_agent_weight_matches_hand_computed_value():
+    """n observations with mean offset m: n m² / (sigma² (1 + rho (n - 1))) against scale², for n = 4 and observability 1."""
+    offset = [(0.5, 0.1), (0.3, -0.1), (0.4, 0.0), (0.4, 0.0)]
+    mean = np.array([1.6, 0.0]) / 4.1  # 0.1 is the regularization of unobservable directions
+    away = 4.0 * mean @ mean / (0.16 * (1.0 + 0.5 * 3.0))
+    assert agent_weights(offset, [0] * 4) == pytest.approx((4.0 / (4.0 + away)) ** 2)
+
+
+def test_equal_offsets_lower_weight_more_than_one():
+    one, four = agent_weights([(1.1, 0.0)], [0]), agent_weights([(1.1, 0.0)] * 4, [0] * 4)
+    apart = agent_weights([(1.1, 0.0), (-1.1, 0.0), (0.0, 1.1), (0.0, -1.1)], [0] * 4)
+    assert one[0] > 0.1 and (four < one).all() and apart == pytest.approx(1.0)
+
+
+def test_agent_beyond_limit_is_rejected_only_where_observable():
+    assert agent_weights([(3.0, 0.0)] * 4, [0] * 4) == pytest.approx(REJECTED_WEIGHT)
+    assert agent_weights([(3.0, 0.0)] * 4, [0] * 4, observability=0.0) == pytest.approx(1.0)
+    mixed = agent_weights([(3.0, 0.0)] * 3 + [(0.1, 0.0)] * 3, [0] * 3 + [1] * 3)
+    assert (mixed[:3] == REJECTED_WEIGHT).all() and (mixed[3:] > 0.95).all()
