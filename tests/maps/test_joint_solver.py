@@ -12,6 +12,7 @@ from manyeyes.datatypes.map_element import BOUNDARY, DIVIDER, MapElements
 from manyeyes.maps.elements.observation import Observation
 from manyeyes.maps.fusion import pose_optimization
 from manyeyes.maps.fusion.joint_solver import (
+    AgentLimits,
     assemble_joint_system,
     compute_marginal_covariance,
     compute_prior_weights,
@@ -27,6 +28,7 @@ from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT, make_initial_sol
 VIEW = np.array([[-20.0, -10.0], [20.0, -10.0], [20.0, 10.0], [-20.0, 10.0]])
 P = np.diag([0.16, 0.16, 1e-4])
 CONFIG = PoseSolverConfig()
+LIMITS = AgentLimits(0.5, 2.0, 3.0, 0.5)
 
 
 def make_observation(at, agent, number, error=(0.0, 0.0, 0.0), covariance=P, noise=0.05, turned=True):
@@ -224,15 +226,16 @@ def agent_weights(offset, agent, observability=1.0):
     """Estimate the agent weight of each observation at this observability."""
     count = len(agent)
     matrix = np.tile(observability * np.eye(2), (count, 1, 1))
-    return estimate_agent_weights(np.array(offset), matrix, np.full(count, 0.16), np.array(agent), (2.0, 3.0, 0.5))
+    return estimate_agent_weights(np.array(offset), matrix, np.full(count, 0.16), np.array(agent), LIMITS)
 
 
 def test_agent_weight_matches_hand_computed_value():
-    """n observations with mean offset m: n m² / (sigma² (1 + rho (n - 1))) against scale², for n = 4 and observability 1."""
+    """n observations with mean offset m: n m² / (sigma² (1 + rho (n - 1))), less the tolerance, for n = 4 and observability 1."""
     offset = [(0.5, 0.1), (0.3, -0.1), (0.4, 0.0), (0.4, 0.0)]
     mean = np.array([1.6, 0.0]) / 4.1  # 0.1 is the regularization of unobservable directions
     away = 4.0 * mean @ mean / (0.16 * (1.0 + 0.5 * 3.0))
-    assert agent_weights(offset, [0] * 4) == pytest.approx((4.0 / (4.0 + away)) ** 2)
+    assert agent_weights(offset, [0] * 4) == pytest.approx((4.0 / (4.0 + (away**0.5 - 0.5) ** 2)) ** 2)
+    assert agent_weights([(0.15, 0.0)], [0]) == pytest.approx(1.0)
 
 
 def test_equal_offsets_lower_weight_more_than_one():

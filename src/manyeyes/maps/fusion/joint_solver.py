@@ -244,8 +244,22 @@ def _gather_blocks(
                         break
 
 
+@dataclass(frozen=True)
+class AgentLimits:
+    """What the mean correction of an agent means, all but the last in standard deviations.
+
+    tolerance: up to it the weight is 1; an honest agent's bias moves its poses, not its weight. scale: of the Geman-McClure weight
+    beyond. rejection: from it on the agent is rejected. bias_fraction: fraction of the prior variance that is common to a drive.
+    """
+
+    tolerance: float
+    scale: float
+    rejection: float
+    bias_fraction: float
+
+
 def estimate_agent_weights(
-    offset: Floats, observability: Floats, prior_variance: Floats, agent: Ints, limits: tuple[float, float, float]
+    offset: Floats, observability: Floats, prior_variance: Floats, agent: Ints, limits: AgentLimits
 ) -> Floats:
     """Estimate agent weights (O,) in (0, 1] from the mean correction of each agent's prior poses (robust M-estimation).
 
@@ -257,11 +271,9 @@ def estimate_agent_weights(
         observability: (O, 2, 2), see :func:`compute_observability`.
         prior_variance: (O,) m², mean variance of the prior position.
         agent: (O,) agent of each observation, from 0.
-        limits: Geman-McClure scale and rejection limit, both in standard deviations; fraction of the prior variance that is
-            common to a drive.
+        limits: see :class:`AgentLimits`.
     """
     count = int(agent.max(initial=-1)) + 1
-    scale, limit, drive_correlation = limits
     weight, pull, prior_sum, num_observations = (
         np.zeros((count, 2, 2)),
         np.zeros((count, 2)),
@@ -276,7 +288,9 @@ def estimate_agent_weights(
     spread = (
         prior_sum
         / num_observations
-        * (1.0 + drive_correlation * (np.trace(weight, axis1=1, axis2=2) / 2 - 1.0).clip(0.0))
+        * (1.0 + limits.bias_fraction * (np.trace(weight, axis1=1, axis2=2) / 2 - 1.0).clip(0.0))
     )
     distance = np.einsum("ai,aij,aj->a", mean, weight, mean).clip(0.0) / np.maximum(spread, 1e-12)
-    return np.where(distance > limit**2, REJECTED_WEIGHT, (scale**2 / (scale**2 + distance)) ** 2)[agent]
+    distance = np.sqrt(distance)
+    beyond = (distance - limits.tolerance).clip(0.0)
+    return np.where(distance > limits.rejection, REJECTED_WEIGHT, _geman_mcclure(beyond**2, limits.scale))[agent]

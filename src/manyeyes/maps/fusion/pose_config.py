@@ -57,8 +57,8 @@ class PoseSolverConfig:
     drive_fraction: fraction of the prior variance that is common to a drive. drift_length_m: distance after which the random
         walk of a
         drive's bias has that variance again. max_drive_gap_m: longer gaps end a drive.
-    agent_scale: Geman-McClure scale of an agent's mean correction; max_agent_error: limit of rejection; both in standard
-        deviations.
+    agent_tolerance, agent_scale, max_agent_error: of an agent's mean correction, in standard deviations: up to the first its weight
+        is 1, then it falls with this Geman-McClure scale, and beyond the last the agent is rejected.
     observation_error_m: standard deviation of corrections beside that of the prior pose, from errors that all lines of an
         observation share.
     damping, align_prior_scale, max_variance_ratio: of the alignment of one observation to a fixed map: fraction of a step that is
@@ -87,7 +87,8 @@ class PoseSolverConfig:
     drive_fraction: float = 0.5
     drift_length_m: float = 2400.0
     max_drive_gap_m: float = 300.0
-    agent_scale: float = 2.0
+    agent_tolerance: float = 1.6
+    agent_scale: float = 0.8
     max_agent_error: float = 2.5
     observation_error_m: float = 0.1
     damping: float = 0.7

@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 from manyeyes.maps.elements.observation import Observation
 from manyeyes.maps.fusion.coarse_search import search_coarse
 from manyeyes.maps.fusion.joint_solver import (
+    AgentLimits,
     JointPriors,
     JointStep,
     PairBlocks,
@@ -281,7 +282,12 @@ def _weigh_agents(state: PoseSolution, information: Floats, decides: bool, confi
         np.eye(2) - (ratio + ratio.transpose(0, 2, 1)) / 2,
         variance + config.observation_error_m**2,
         agent,
-        (config.agent_scale, config.max_agent_error if decides else np.inf, config.drive_fraction),
+        AgentLimits(
+            config.agent_tolerance,
+            config.agent_scale,
+            config.max_agent_error if decides else np.inf,
+            config.drive_fraction,
+        ),
     )
     stays_rejected = (state.agent_weight <= REJECTED_WEIGHT) & (not decides)
     weight = np.where(stays_rejected, REJECTED_WEIGHT, weight)
