@@ -30,6 +30,8 @@ Ints = NDArray[np.int64]
 _VIEW_CELL_M = 32.0
 _POINT_CELL_M = 2.5
 _DAY_S = 86400.0
+POINT_VARIANCE_M2 = 0.04
+"""Lateral variance of a point of weight 1, metres squared."""
 
 # Relation of an observation to a station: no line, a line within the gates, or one at a small lateral offset.
 UNMATCHED, MATCHED, NEARBY = 0, 1, 2
@@ -344,13 +346,15 @@ def accumulate_evidence(
     pose: Floats,
     weight: Floats,
     is_inlier: NDArray[np.bool_],
+    common_covariance: Floats,
     config: EvidenceConfig = EvidenceConfig(),
 ) -> tuple[Floats, EvidenceTable]:
     """Accumulate the evidence for line stations (K,) at xy with unit tangents from all observations, with agents at pose (O,
     3): metres (K,) along the normal to the position that the observations agree on, and the evidence.
 
-    weight: (P,) weight of each point in the lateral position; points of weight 0 are no detections. A detection counts once per
-    observation. is_inlier: (O,) observations whose misses count.
+    weight: (P,) weight of each point in the lateral position, POINT_VARIANCE_M2 over its variance; points of weight 0 are no
+    detections. A detection counts once per observation. is_inlier: (O,) observations whose misses count. common_covariance: (O, 3, 3)
+    of the poses, what observations of one place share, which averaging does not reduce.
     """
     points = np.flatnonzero(is_line(arrays.kind_of_point) & (weight > 0.0))
     world, direction = arrays.to_world(pose)
@@ -377,7 +381,23 @@ def accumulate_evidence(
         np.array(config.decay_time_s),
         evidence,
     )
+    common = _compute_common_variance(xy, tangent, evidence.source_offsets, sources, pose, common_covariance)
+    evidence = evidence._replace(sigma=np.sqrt(evidence.sigma**2 + common))
     return shift, evidence.with_sources(sources, arrays.digests)
+
+
+def _compute_common_variance(
+    xy: Floats, tangent: Floats, offsets: Ints, sources: Ints, pose: Floats, common_covariance: Floats
+) -> Floats:
+    """Compute the lateral variance (K,) at stations by the common covariance of the poses of their sources, mean over them."""
+    count = np.diff(offsets)
+    station = np.repeat(np.arange(len(count)), count)
+    lever = xy[station] - pose[sources, :2]
+    normal = np.stack((-tangent[station, 1], tangent[station, 0]), 1)
+    turn = normal[:, 1] * lever[:, 0] - normal[:, 0] * lever[:, 1]
+    jacobian = np.concatenate((normal, turn[:, None]), 1)
+    variance = np.einsum("si,sij,sj->s", jacobian, common_covariance[sources], jacobian).clip(0.0)
+    return np.bincount(station, variance, len(count)) / np.maximum(1, count)
 
 
 class _EvidenceStations(NamedTuple):
@@ -554,7 +574,7 @@ def _estimate_shift(
         scratch.candidates,
     )
     kernel, floor = params.kernel_m, params.bias_m
-    place, spread = 0.0, 1.0
+    place, spread = 0.0, kernel
     for turn in range(4):
         total, aside, information = 0.0, 0.0, 0.0
         # The kernel narrows after the first iteration, so that the result depends little on the start.
@@ -569,9 +589,10 @@ def _estimate_shift(
                 aside += w * d
                 information += w * g
         if total <= 0.0:
-            return 0.0, 1.0
+            return 0.0, float(kernel)
         place = aside / total
-        spread = np.sqrt(1.0 / max(information, 1e-9) + floor * floor)
+        # What lies farther away than the kernel is not of this line, so that its scale bounds the error.
+        spread = np.sqrt(1.0 / (information / POINT_VARIANCE_M2 + 1.0 / kernel**2) + floor * floor)
     return float(place), float(spread)
 
 

@@ -18,7 +18,13 @@ from manyeyes.datatypes.map_element import STYLES, take_rows
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED
 from manyeyes.maps.fusion.coverage import find_observed_cells, merge_runs
 from manyeyes.maps.fusion.crossings import CrossingConfig, FusedCrossings, fuse_crossings
-from manyeyes.maps.fusion.existence import EvidenceConfig, EvidenceTable, accumulate_evidence, find_covered_by_inliers
+from manyeyes.maps.fusion.existence import (
+    POINT_VARIANCE_M2,
+    EvidenceConfig,
+    EvidenceTable,
+    accumulate_evidence,
+    find_covered_by_inliers,
+)
 from manyeyes.maps.fusion.mean_shift import RidgeConfig, mean_shift_to_ridges, thin_ridges
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays, is_line
 from manyeyes.maps.fusion.observation_weights import compute_observation_weights
@@ -112,12 +118,14 @@ def build_stations(
     arrays: all observations that reach into the area widened by the halo. solution: contains all of their poses.
     """
     rows = solution.row_indices(arrays.ids)
-    pose, covariance = solution.pose[rows], solution.covariance[rows]
+    pose, covariance, common_covariance = (
+        table[rows] for table in (solution.pose, solution.covariance, solution.common_covariance)
+    )
     weight = compute_observation_weights(
         arrays, solution.initial_pose[rows], solution.scale[rows], solution.agent_weight[rows]
     )
     is_inlier = solution.agent_weight[rows] > REJECTED_WEIGHT
-    lines = _build_line_stations(arrays, pose, covariance, (weight, is_inlier), area, config)
+    lines = _build_line_stations(arrays, pose, (covariance, common_covariance), (weight, is_inlier), area, config)
     rank = np.argsort(np.argsort(np.array(arrays.ids)))
     crossings = fuse_crossings(arrays, pose, weight, rank, config.polygon, config.evidence)
     ring, ring_offsets, ring_xy = _rings_inside(crossings, area, config)
@@ -128,15 +136,17 @@ def build_stations(
 def _build_line_stations(
     arrays: ObservationArrays,
     pose: Floats,
-    covariance: Floats,
+    covariances: tuple[Floats, Floats],
     observation_weights: tuple[Floats, NDArray[np.bool_]],
     area: Area | None,
     config: StationConfig,
 ) -> tuple[Floats, Floats, EvidenceTable]:
     """Build positions, tangents and evidence of line stations in the area.
 
-    observation_weights: weight (O,) and inlier flag (O,) of the observations.
+    covariances: of the poses (O, 3, 3), given all others and in common. observation_weights: weight (O,) and inlier flag (O,) of the
+    observations.
     """
+    covariance, common_covariance = covariances
     xy, tangent = arrays.to_world(pose)
     weight, is_inlier = observation_weights
     point_weight = _compute_point_weights(arrays, xy, tangent, pose, covariance) * weight[arrays.observation_of_point]
@@ -161,7 +171,9 @@ def _build_line_stations(
     kept = thin_ridges(places, turned, arrays.kind_of_point[seeds], arrays.priority[seeds], config.ridge)
     seeds, places, turned = seeds[kept], places[kept], turned[kept]
     kind = arrays.kind_of_point[seeds]
-    shift, found = accumulate_evidence(places, turned, kind, arrays, pose, point_weight, is_inlier, config.evidence)
+    shift, found = accumulate_evidence(
+        places, turned, kind, arrays, pose, point_weight, is_inlier, common_covariance, config.evidence
+    )
     normal = np.stack((-turned[:, 1], turned[:, 0]), 1)
     places = places + shift[:, None] * normal
     has_support = (found.support >= config.min_support) | (found.coverage < config.min_support_coverage)
@@ -185,13 +197,13 @@ def _publish_low_coverage(table: EvidenceTable, config: EvidenceConfig) -> Evide
 def _compute_point_weights(
     arrays: ObservationArrays, xy: Floats, tangent: Floats, pose: Floats, covariance: Floats
 ) -> Floats:
-    """Compute (P,) 1 / lateral variance by detection and pose, relative to that of a point with sigma 0.2 m."""
+    """Compute (P,) 1 / lateral variance by detection and pose, relative to POINT_VARIANCE_M2."""
     owner = arrays.observation_of_point
     normal = np.stack((-tangent[:, 1], tangent[:, 0]), 1)
     lever = xy - pose[owner, :2]
     jacobian = np.concatenate((normal, (normal[:, 1] * lever[:, 0] - normal[:, 0] * lever[:, 1])[:, None]), 1)
     spread = np.einsum("pi,pij,pj->p", jacobian, covariance[owner], jacobian)
-    return 0.04 / (arrays.sigma**2 + 0.1**2 + spread)
+    return POINT_VARIANCE_M2 / (arrays.sigma**2 + 0.1**2 + spread)
 
 
 def _within(xy: Floats, area: Area | None, halo: float) -> NDArray[np.bool_]:
