@@ -306,15 +306,22 @@ def test_l_the_map_moves_with_the_world(motion):
 
 
 @pytest.mark.slow
-def test_colluding_agents_displace_no_station_observed_by_honest_agents():
+@pytest.mark.parametrize("seed", [5, 6, 7])
+def test_colluding_agents_displace_no_station_observed_by_honest_agents(seed):
+    """An offset of 1 m is 2.5 sigmas of a prior pose, which some honest agents have: there the displacement is bounded alone."""
     world = [*road(), (CROSSING, np.array([[40.0, -5.0], [44.0, -5.0], [44.0, 5.0], [40.0, 5.0]]))]
     honest = crowd(world, 40)
-    for offset in (1.0, 2.0, 4.0):
-        malicious = [replace(o, agent=f"malicious{k}", elements=o.elements.with_points(o.elements.points + (0.0, offset)))
-                 for k, o in enumerate(crowd(world, 10, seed=5))]  # fmt: skip
-        malicious = [replace(o, pose=(o.pose[0], o.pose[1], o.pose[2])) for o in malicious if np.cos(o.pose[2]) > 0]
-        before, after = fuse(honest).select_published(), fuse([*honest, *malicious]).select_published()
-        assert furthest(before.elements, after.elements) < 0.1, offset
+    before = fuse(honest).select_published().elements
+    for offset, limit in ((1.0, 0.25), (2.0, 0.05), (4.0, 0.05)):
+        malicious = [
+            replace(o, agent=f"malicious{k}", elements=o.elements.with_points(o.elements.points + (0.0, offset)))
+            for k, o in enumerate(crowd(world, 10, seed=seed))
+            if np.cos(o.pose[2]) > 0
+        ]
+        after = fuse([*honest, *malicious]).select_published().elements
+        # The last station of a line may come or go with a rejected agent.
+        inside = before.points[(before.points[:, 0] > 3.0) & (before.points[:, 0] < 97.0)]
+        assert find_nearest_line(inside, after.points, after.offsets, 50.0).distance.max() < limit, offset
 
 
 def test_rejected_agents_leave_poses_unchanged():

@@ -353,8 +353,8 @@ def accumulate_evidence(
     3): metres (K,) along the normal to the position that the observations agree on, and the evidence.
 
     weight: (P,) weight of each point in the lateral position, POINT_VARIANCE_M2 over its variance; points of weight 0 are no
-    detections. A detection counts once per observation. is_inlier: (O,) observations whose misses count. common_covariance: (O, 3, 3)
-    of the poses, what observations of one place share, which averaging does not reduce.
+    detections. A detection counts once per observation. is_inlier: (O,) observations whose misses count. common_covariance:
+    (O, 3, 3) of the poses, what observations of one place share, which averaging does not reduce.
     """
     points = np.flatnonzero(is_line(arrays.kind_of_point) & (weight > 0.0))
     world, direction = arrays.to_world(pose)

@@ -143,8 +143,8 @@ def _build_line_stations(
 ) -> tuple[Floats, Floats, EvidenceTable]:
     """Build positions, tangents and evidence of line stations in the area.
 
-    covariances: of the poses (O, 3, 3), given all others and in common. observation_weights: weight (O,) and inlier flag (O,) of the
-    observations.
+    covariances: of the poses (O, 3, 3), given all others and in common. observation_weights: weight (O,) and inlier flag (O,) of
+    the observations.
     """
     covariance, common_covariance = covariances
     xy, tangent = arrays.to_world(pose)
