@@ -171,6 +171,14 @@ def test_pairs_equal_stations_as_unknowns():
     np.testing.assert_allclose(found.increment[:, [0, 2]], 0.0, atol=1e-9)
 
 
+def test_iterations_equal_factors(crossroads):
+    _, _, blocks, priors = make_problem(crossroads, JointIteration(2.0, 0.8, 9.0))
+    direct, iterated = solve_joint_step(blocks, priors, 9.0), solve_joint_step(blocks, priors, 9.0, 1e-9)
+    np.testing.assert_allclose(iterated.increment, direct.increment, atol=1e-7)
+    np.testing.assert_allclose(iterated.bias, direct.bias, atol=1e-7)
+    assert direct.factor is not None and iterated.factor is None
+
+
 def test_marginal_covariance_equals_the_dense_inverse(crossroads):
     _, _, blocks, priors = make_problem(crossroads, JointIteration(2.0, 0.8, 9.0))
     system, _ = assemble_joint_system(blocks, priors, *compute_prior_weights(priors, 9.0))

@@ -16,14 +16,17 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csc_array
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse import bsr_array, coo_array, csc_array
+from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 
 from manyeyes._jit import F64x1, F64x3, I64x1, njit
 from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+MAX_ITERATIONS = 400
+"""Of conjugate gradients; a step that needs more is continued by the next one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,14 +96,14 @@ class JointPriors:
 @dataclass(frozen=True, eq=False)
 class JointStep:
     """Result of one step: increments of the poses (O, 3), biases (S, 3), the weights of the priors of observations (O,) and of the
-    drives of the states (S,), and the factorized system.
+    drives of the states (S,), and the factorized system, None where it was solved iteratively.
     """
 
     increment: Floats
     bias: Floats
     look_weight: Floats
     drive_weight: Floats
-    factor: SuperLU
+    factor: SuperLU | None
 
 
 def compute_prior_weights(priors: JointPriors, scale: float) -> tuple[Floats, Floats]:
@@ -128,14 +131,36 @@ def _state_information(priors: JointPriors) -> Floats:
     return np.asarray(np.linalg.inv(priors.bias_fraction * covariance / number[:, None, None]), np.float64)
 
 
-def solve_joint_step(pairs: PairBlocks, priors: JointPriors, scale: float) -> JointStep:
-    """Solve one Gauss-Newton step of all poses and biases together; scale: of the priors' Geman-McClure weights, in sigmas."""
+def solve_joint_step(pairs: PairBlocks, priors: JointPriors, scale: float, tolerance: float | None = None) -> JointStep:
+    """Solve one Gauss-Newton step of all poses and biases together; scale: of the priors' Geman-McClure weights, in sigmas.
+
+    tolerance: relative residual of conjugate gradients, whose cost grows in proportion to the observations; None: by factors.
+    """
     look_weight, drive_weight = compute_prior_weights(priors, scale)
     system, right_side = assemble_joint_system(pairs, priors, look_weight, drive_weight)
-    factor = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-    found = factor.solve(right_side)
+    factor = None
+    if tolerance is None:
+        factor = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        found = factor.solve(right_side)
+    else:
+        found = _solve_iteratively(system, right_side, tolerance)
     count = 3 * len(priors.correction)
     return JointStep(found[:count].reshape(-1, 3), found[count:].reshape(-1, 3), look_weight, drive_weight, factor)
+
+
+def _solve_iteratively(system: csc_array, right_side: Floats, tolerance: float) -> Floats:
+    """Solve by conjugate gradients with the blocks on the diagonal as preconditioner."""
+    blocks = bsr_array(system, blocksize=(3, 3))
+    size = len(blocks.indptr) - 1
+    on_diagonal = np.repeat(np.arange(size), np.diff(blocks.indptr)) == blocks.indices
+    inverse = np.linalg.inv(blocks.data[on_diagonal])
+
+    def precondition(vector: Floats) -> Floats:
+        return np.einsum("nij,nj->ni", inverse, vector.reshape(-1, 3)).reshape(-1)
+
+    return cg(blocks, right_side, rtol=tolerance, maxiter=MAX_ITERATIONS, M=LinearOperator(system.shape, precondition))[
+        0
+    ]
 
 
 def assemble_joint_system(

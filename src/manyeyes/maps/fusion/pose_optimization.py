@@ -54,6 +54,8 @@ from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT, PairSums, PoseSo
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+STEP_TOLERANCE = 1e-3
+"""Relative residual of the joint steps but the last; what is left of a step is in the next one."""
 _BOUND_CELL_M = 8.0
 _PAIR_CELL_M = 1.0
 # Of the upper triangle (xx, xy, xt, yy, yt, tt), the entries of a symmetric matrix in order of rows.
@@ -204,10 +206,11 @@ def merge_solutions(
         return replace(whole, pairs=None)
     blocks = _assemble_blocks(whole.pairs, whole.ids)
     priors = _make_priors(whole, config)
-    solved = solve_joint_step(blocks, priors, step.joint.prior_scale)
+    # The last step is solved by factors, which give the covariance, too.
+    solved = solve_joint_step(blocks, priors, step.joint.prior_scale, None if step.is_last else STEP_TOLERANCE)
     state = replace(_apply_step(whole, blocks, priors, solved, config), scale=_estimate_scale(whole, whole.pairs))
     state = _weigh_agents(state, blocks.own, step.decides, config)
-    if step.is_last:
+    if solved.factor is not None:
         marginal = compute_marginal_covariance(solved.factor, len(whole.ids))
         marginal[priors.fixed] = whole.prior_covariance[priors.fixed]
         state = replace(state, common_covariance=marginal - state.covariance)
