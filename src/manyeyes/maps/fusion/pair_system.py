@@ -24,7 +24,7 @@ from manyeyes.maps.fusion.point_grid import find_cell_range, line_residual
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-NUM_OWN, NUM_SHARED = 11, 18
+NUM_OWN, NUM_SHARED, NUM_SUMS = 11, 18, 14
 
 
 class OwnPoints(NamedTuple):
@@ -81,7 +81,7 @@ def sum_pairs(
     radius, stride = np.sqrt(far), limits.point_stride
     own, offsets = np.zeros((len(home), NUM_OWN)), np.zeros(len(home) + 1, np.int64)
     slot, met = np.full(len(pose), -1), np.empty(len(pose), np.int64)
-    sums = np.zeros((len(pose), NUM_SHARED))
+    sums, alone = np.zeros((len(pose), NUM_SUMS)), np.zeros(NUM_SUMS)
     other, shared, filled = np.empty(64, np.int64), np.empty((64, NUM_SHARED)), 0
     near, gain = np.empty(256, np.int64), np.empty((256, 4))
     for h in range(len(home)):
@@ -103,26 +103,29 @@ def sum_pairs(
                 j = other_points.observation[q]
                 # The other point's residual about the same station is the second half of the pair.
                 w = unit * w / (mine + total) * (0.5 * mine if weight[o] > 0.0 else 1.0)
-                _add_own(own[h], w, (jx, jy, jt), r)
                 square += gain[m, 0] * r * r
                 if weight[o] <= 0.0:
+                    _add_pair(alone, w, (jx, jy, jt), 0.0, r)
                     continue
                 if slot[j] < 0:
                     slot[j], met[n] = n, j
                     sums[n] = 0.0
                     n += 1
-                at = sums[slot[j]]
                 lx, ly = other_points.xy[q, 0] - pose[j, 0], other_points.xy[q, 1] - pose[j, 1]
-                lt = jy * lx - jx * ly
-                _add_shared(at, w, (jx, jy, jt), lt, r)
+                _add_pair(sums[slot[j]], w, (jx, jy, jt), jy * lx - jx * ly, r)
             vote = total / (total + 0.5)
             own[h, 9] += vote * square / total
             own[h, 10] += vote
         order = np.sort(met[:n])
         while filled + n > len(other):
             other, shared = _longer(other), _taller(shared)
+        _add_own(own[h], alone)
+        alone[:] = 0.0
         for i in range(n):
-            other[filled], shared[filled] = order[i], sums[slot[order[i]]]
+            row = sums[slot[order[i]]]
+            _add_own(own[h], row)
+            other[filled] = order[i]
+            _set_shared(shared[filled], row)
             filled += 1
         for i in range(n):
             slot[met[i]] = -1
@@ -131,46 +134,67 @@ def sum_pairs(
 
 
 @njit(cache=True, nogil=True)
-def _add_own(
-    row: F64x1, w: float, jacobian: tuple[float, float, float], r: float
+def _add_pair(
+    row: F64x1, w: float, jacobian: tuple[float, float, float], lt: float, r: float
 ) -> None:  # pragma: no cover - compiled
-    """Add a pair of weight w and residual r to the first 9 columns of own."""
+    """Add a pair of weight w and residual r to the sums of its two observations.
+
+    jacobian: (jx, jy, jt) by the pose of the observation itself; lt: by the heading of the other one, whose first two are -jx, -jy.
+    Columns: jx jx, jx jy, jy jy, jx lt, jy lt, lt lt, jt jx, jt jy, jt lt, jx r, jy r, lt r, jt jt, jt r.
+    """
     jx, jy, jt = jacobian
-    row[0] += w * jx * jx
-    row[1] += w * jx * jy
-    row[2] += w * jx * jt
-    row[3] += w * jy * jy
-    row[4] += w * jy * jt
-    row[5] += w * jt * jt
-    row[6] += w * jx * r
-    row[7] += w * jy * r
-    row[8] += w * jt * r
+    x, y, t, s = w * jx, w * jy, w * lt, w * jt
+    row[0] += x * jx
+    row[1] += x * jy
+    row[2] += y * jy
+    row[3] += x * lt
+    row[4] += y * lt
+    row[5] += t * lt
+    row[6] += s * jx
+    row[7] += s * jy
+    row[8] += s * lt
+    row[9] += x * r
+    row[10] += y * r
+    row[11] += t * r
+    row[12] += s * jt
+    row[13] += s * r
 
 
 @njit(cache=True, nogil=True)
-def _add_shared(
-    row: F64x1, w: float, jacobian: tuple[float, float, float], lt: float, r: float
-) -> None:  # pragma: no cover - compiled
-    """Add a pair to the columns of shared; lt: derivative by the heading of the other observation."""
-    jx, jy, jt = jacobian
-    row[0] -= w * jx * jx
-    row[1] -= w * jx * jy
-    row[2] -= w * jx * lt
-    row[3] -= w * jy * jx
-    row[4] -= w * jy * jy
-    row[5] -= w * jy * lt
-    row[6] -= w * jt * jx
-    row[7] -= w * jt * jy
-    row[8] -= w * jt * lt
-    row[9] += w * jx * jx
-    row[10] += w * jx * jy
-    row[11] += w * jx * lt
-    row[12] += w * jy * jy
-    row[13] += w * jy * lt
-    row[14] += w * lt * lt
-    row[15] -= w * jx * r
-    row[16] -= w * jy * r
-    row[17] -= w * lt * r
+def _add_own(own: F64x1, row: F64x1) -> None:  # pragma: no cover - compiled
+    """Add sums of :func:`_add_pair` to the first 9 columns of own."""
+    own[0] += row[0]
+    own[1] += row[1]
+    own[2] += row[6]
+    own[3] += row[2]
+    own[4] += row[7]
+    own[5] += row[12]
+    own[6] += row[9]
+    own[7] += row[10]
+    own[8] += row[13]
+
+
+@njit(cache=True, nogil=True)
+def _set_shared(shared: F64x1, row: F64x1) -> None:  # pragma: no cover - compiled
+    """Set shared from sums of :func:`_add_pair`."""
+    shared[0] = -row[0]
+    shared[1] = -row[1]
+    shared[2] = -row[3]
+    shared[3] = -row[1]
+    shared[4] = -row[2]
+    shared[5] = -row[4]
+    shared[6] = -row[6]
+    shared[7] = -row[7]
+    shared[8] = -row[8]
+    shared[9] = row[0]
+    shared[10] = row[1]
+    shared[11] = row[3]
+    shared[12] = row[2]
+    shared[13] = row[4]
+    shared[14] = row[5]
+    shared[15] = -row[9]
+    shared[16] = -row[10]
+    shared[17] = -row[11]
 
 
 @njit(cache=True, nogil=True)
