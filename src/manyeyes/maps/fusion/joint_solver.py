@@ -2,12 +2,10 @@
 """Joint least squares over the poses of all observations and the errors of all drives: one robust Gauss-Newton step.
 
 The prior pose of observation o of drive d is off by b_do + e_o. The bias b of a drive starts from N(0, rho P) and drifts as a
-random
-walk over the distance driven; e is independent and has (1 - rho) P. Pairs of points (:mod:`manyeyes.maps.fusion.pair_system`)
-couple
-the poses of different observations. All of it is one sparse linear system a step, solved directly. Each e and the first bias
-of each
-drive have a Geman-McClure weight, so that one bad observation, or one bad drive, releases its own prior and no other.
+random walk over the distance driven; e is independent and has (1 - rho) P. Pairs of points
+(:mod:`manyeyes.maps.fusion.pair_system`) couple the poses of different observations. All of it is one sparse linear system a
+step, solved directly. Each e and the first bias of each drive have a Geman-McClure weight, so that one bad observation, or one
+bad drive, releases its own prior and no other.
 """
 
 from __future__ import annotations

@@ -2,13 +2,10 @@
 """Couple the poses of overlapping observations by the lines that they share, with the stations of the lines eliminated.
 
 A station s on a line that n observations detect has the residuals e_i = u'(T_i p_i) - u's, weighted by w_i, along the normal u of
-the line. Eliminating s (Schur complement) leaves sum_i w_i (e_i - mean)^2 = 1/2 sum_ij w_i w_j / sum_k w_k (e_i - e_j)^2, a
-sum over
-pairs of observations (Triggs et al., Bundle Adjustment, 1999, section 6). Here the members of the station of point p are the
-points
-q of other observations around it, each with the weight of a redescending kernel (Geman-McClure) and of its longitudinal
-distance, so
-that no association is hard. Residuals are lateral, along the mean normal of both lines, which has no bias on a bend.
+the line. Eliminating s (Schur complement) leaves sum_i w_i (e_i - mean)^2 = 1/2 sum_ij w_i w_j / sum_k w_k (e_i - e_j)^2, a sum
+over pairs of observations (Triggs et al., Bundle Adjustment, 1999, section 6). Here the members of the station of point p are the
+points q of other observations around it, each with the weight of a redescending kernel (Geman-McClure) and of its longitudinal
+distance, so that no association is hard. Residuals are lateral, along the mean normal of both lines, which has no bias on a bend.
 """
 
 from __future__ import annotations
@@ -72,8 +69,7 @@ def sum_pairs(
     :class:`~manyeyes.maps.fusion.pose_solution.PairSums`.
 
     pose: (O, 3) about whose positions the observations turn. weight: (O,) weight of each observation's lines; where it is 0
-        the lines
-    move the observation, and no other by it.
+        the lines move the observation, and no other by it.
     """
     first, xy, sigma = own_points.offsets, own_points.xy, own_points.sigma
     gate, reach, c2 = limits.gate_m, limits.max_longitudinal_m, limits.kernel_m**2

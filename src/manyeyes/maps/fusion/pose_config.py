@@ -14,9 +14,8 @@ from manyeyes.maps.fusion.coarse_search import CoarseSearchConfig
 class JointIteration:
     """Widths of one joint step.
 
-    gate_m, kernel_m: lateral gate and Geman-McClure scale of the pairs, metres. prior_scale: Geman-McClure scale of the
-        priors, in
-    standard deviations. point_stride: every n-th point of an observation is used.
+    gate_m, kernel_m: lateral gate and Geman-McClure scale of the pairs, metres. prior_scale: Geman-McClure scale of the priors,
+        in standard deviations. point_stride: every n-th point of an observation is used.
     """
 
     gate_m: float
@@ -44,19 +43,16 @@ class PoseSolverConfig:
 
     spacing_m: distance of the sampled points.
     num_iterations: joint steps of the final pass; num_rejection_iterations: of a rejection pass; num_rejection_passes: number
-        of such
-        passes, each followed by a repeated search; rejection_point_stride: every n-th point is used in them.
-    gate_m, kernel_m, prior_scale: first and last lateral gate, Geman-McClure scale of the pairs, and Geman-McClure scale of
-        the priors
-        in standard deviations. They fall geometrically over the first settled_fraction of a pass and then stay.
+        of such passes, each followed by a repeated search; rejection_point_stride, final_point_stride: every n-th point is used.
+    gate_m, kernel_m, prior_scale: first and last lateral gate, Geman-McClure scale of the pairs, and Geman-McClure scale of the
+        priors in standard deviations. They fall geometrically over the first settled_fraction of a pass and then stay.
     max_longitudinal_m, max_heading_rad: longitudinal and heading gate of pairs.
     sigma_m: standard deviation of the lines beside their own. points_per_independent: points of one line that count as one.
     surveyed_weight: weight of a surveyed pole's lines.
     max_step_m, max_step_rad: largest correction in one step.
     max_observations_per_cell: observations that count per cell of 8 m, class and heading.
     drive_fraction: fraction of the prior variance that is common to a drive. drift_length_m: distance after which the random
-        walk of a
-        drive's bias has that variance again. max_drive_gap_m: longer gaps end a drive.
+        walk of a drive's bias has that variance again. max_drive_gap_m: longer gaps end a drive.
     agent_tolerance, agent_scale, max_agent_error: of an agent's mean correction, in standard deviations: up to the first its weight
         is 1, then it falls with this Geman-McClure scale, and beyond the last the agent is rejected.
     observation_error_m: standard deviation of corrections beside that of the prior pose, from errors that all lines of an
@@ -72,6 +68,7 @@ class PoseSolverConfig:
     num_rejection_iterations: int = 6
     num_rejection_passes: int = 2
     rejection_point_stride: int = 3
+    final_point_stride: int = 2
     gate_m: tuple[float, float] = (2.0, 1.0)
     kernel_m: tuple[float, float] = (0.8, 0.5)
     prior_scale: tuple[float, float] = (9.0, 3.0)
@@ -104,7 +101,7 @@ class PoseSolverConfig:
         for _ in range(self.num_rejection_passes):
             out += [SolverStep(one, decides=one is rejection[-1]) for one in rejection]
             out.append(SolverStep(None))
-        final = self._anneal(self.num_iterations, 1)
+        final = self._anneal(self.num_iterations, self.final_point_stride)
         return (*out, *(SolverStep(one, is_last=one is final[-1]) for one in final))
 
     @property

@@ -2,27 +2,22 @@
 """Joint pose correction of all observations and drives: robust nonlinear least squares on the lines that observations share.
 
 The unknowns are the pose of every observation and the error of every drive's prior poses
-(:mod:`manyeyes.maps.fusion.joint_solver`); the stations of the lines are eliminated
-(:mod:`manyeyes.maps.fusion.pair_system`). Each step
-associates points at the current poses, then solves one sparse system for all unknowns, so the order of observations has no
-effect.
-Kernels narrow from step to step (graduated non-convexity). Directions that no line determines, such as along a straight road,
-keep
-the prior.
+(:mod:`manyeyes.maps.fusion.joint_solver`); the stations of the lines are eliminated (:mod:`manyeyes.maps.fusion.pair_system`).
+Each step associates points at the current poses, then solves one sparse system for all unknowns, so the order of observations has
+no effect. Kernels narrow from step to step (graduated non-convexity). Directions that no line determines, such as along a
+straight road, keep the prior.
 
-The solution runs in passes. A rejection pass ends with a decision which agents' prior poses share a bias that their
-covariance does
-not explain. Then the solution starts again from the prior poses without the lines of those agents, so that a rejected agent
+The solution runs in passes. A rejection pass ends with a decision which agents' prior poses share a bias that their covariance
+does not explain. Then the solution starts again from the prior poses without the lines of those agents, so that a rejected agent
 influences neither the coarse search nor intermediate poses. The second rejection pass uses inlier agents alone and decides on all
 agents again at its end, so that wrongly rejected agents are reinstated. A rejected agent's observations are aligned to the
 others.
 
 The association and the sums of an observation depend only on observations that overlap it. So a large area is handled tile by
-tile
-with the same result: :func:`search_coarse_poses` and each :func:`run_step` run for the home observations of each tile, given all
-observations that :func:`find_overlapping` returns and the poses after the previous step. :func:`merge_solutions` joins the
-sums of the
-tiles and solves. :func:`solve_poses` is the case of one tile. The map is defined as the result of the fixed number of steps.
+tile with the same result: :func:`search_coarse_poses` and each :func:`run_step` run for the home observations of each tile, given
+all observations that :func:`find_overlapping` returns and the poses after the previous step. :func:`merge_solutions` joins the
+sums of the tiles and solves. :func:`solve_poses` is the case of one tile. The map is defined as the result of the fixed number of
+steps.
 """
 
 from __future__ import annotations
@@ -54,7 +49,7 @@ from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT, PairSums, PoseSo
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-STEP_TOLERANCE = 1e-3
+STEP_TOLERANCE = 1e-5
 """Relative residual of the joint steps but the last; what is left of a step is in the next one."""
 _BOUND_CELL_M = 8.0
 _PAIR_CELL_M = 1.0
