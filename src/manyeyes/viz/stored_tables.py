@@ -105,14 +105,14 @@ def _find_split(origin: dict[str, Any], result: dict[str, Any]) -> str:
     return str(options.get("validation_split") or options.get("split") or result.get("split") or "")
 
 
+def _is_speed(result: dict[str, Any]) -> bool:
+    """Return whether a result is of the benchmark of speed."""
+    return "settings" in result and "contender" in (result.get("rows") or [{}])[0]
+
+
 def _has_no_recording(result: dict[str, Any]) -> bool:
     """Return whether a result is of a benchmark whose scenes are made by its seed."""
-    return (
-        is_pose_lines(result)
-        or is_pose_rows(result)
-        or ("settings" in result and "contender" in (result.get("rows") or [{}])[0])
-        or _has_simulated_scenes(result)
-    )
+    return is_pose_lines(result) or is_pose_rows(result) or _is_speed(result) or _has_simulated_scenes(result)
 
 
 def _has_simulated_scenes(result: dict[str, Any]) -> bool:
@@ -243,7 +243,7 @@ _KINDS: tuple[tuple[Callable[[dict[str, Any]], bool], Callable[[dict[str, Any]],
     (lambda result: "cases" in result, _make_cases),
     (lambda result: "stats" in result and "rows" in result, _make_evaluation),
     (lambda result: "cpu_minutes" in result and "rows" in result, _make_finetune),
-    (_has_no_recording, _make_speed),
+    (_is_speed, _make_speed),
     (lambda result: result.get("study") == "main-table", make_main_tables),
     (lambda result: result.get("study") == "robustness", make_robustness_tables),
     (lambda result: "study" in result and "tables" in result, make_printed_tables),
