@@ -255,9 +255,10 @@ def test_robustness_is_perturbations_by_methods_of_one_form(tmp_path: Path) -> N
     assert tables["robustness-temporal-ap70"][1] == ("clean", "-") and len(tables) == 4
 
 
-def test_tables_that_a_study_printed_are_those_of_the_document(tmp_path: Path) -> None:
+@pytest.mark.parametrize("rows", [{"study": "byte-curves", "rows": []}, {"study": "fusion", "summaries": []}])
+def test_tables_that_a_study_printed_are_those_of_the_document(tmp_path: Path, rows: dict[str, Any]) -> None:
     printed = {"title": "AP against bytes, with memory", "headings": ["method", "AP"], "lines": [["late", "0.9"]]}
-    result = {"study": "byte-curves", "rows": [], "tables": [printed]}
+    result = {**rows, "tables": [printed]}
     (table,) = make_tables(load_result(write(tmp_path / "b.json", result)))
     assert (table.name, table.lines) == ("ap-against-bytes-with-memory", [("method", "AP"), ("late", "0.9")])
 
