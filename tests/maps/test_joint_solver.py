@@ -124,7 +124,7 @@ def test_a_step_equals_that_of_a_dense_least_squares(crossroads):
     count, rows = len(arrays), []
     for weight, derivative, residual in sum_pairs_slowly(arrays, np.asarray(arrays.pose), order, widths, CONFIG):
         rows.append((weight, np.concatenate((derivative, np.zeros(3 * count))), residual))
-    look, drive = compute_prior_weights(priors, 4.0)
+    own, drive = compute_prior_weights(priors, 4.0)
     half = np.linalg.cholesky(np.linalg.inv(0.5 * P)).T
     for o in range(count):
         s = priors.chain.state[o]
@@ -132,7 +132,7 @@ def test_a_step_equals_that_of_a_dense_least_squares(crossroads):
             derivative = np.zeros(6 * count)
             derivative[3 * o : 3 * o + 3] = half[axis]
             derivative[3 * (count + s) : 3 * (count + s) + 3] = -half[axis]
-            rows.append((look[o], derivative, half[axis] @ priors.correction[o]))
+            rows.append((own[o], derivative, half[axis] @ priors.correction[o]))
     for s in range(count):
         before = priors.chain.previous[s]
         for axis in range(3):
@@ -189,7 +189,7 @@ def test_marginal_covariance_equals_the_dense_inverse(crossroads):
 
 
 def make_drives(sigma, covariance, bad=0.0):
-    """Six drives of four looks along one road; the second look of the first drive is off by ``bad`` across it."""
+    """Six drives of four observations along one road; the second of the first drive is off by ``bad`` across it."""
     rng = np.random.default_rng(11)
     common, own = rng.normal(0.0, 1.0, (6, 3)), rng.normal(0.0, 1.0, (6, 4, 3))
     scale = np.sqrt(0.5) * sigma * np.array([1.0, 1.0, 0.02])

@@ -392,12 +392,16 @@ def _compute_common_variance(
     """Compute the lateral variance (K,) at stations by the common covariance of the poses of their sources, mean over them."""
     count = np.diff(offsets)
     station = np.repeat(np.arange(len(count)), count)
-    lever = xy[station] - pose[sources, :2]
-    normal = np.stack((-tangent[station, 1], tangent[station, 0]), 1)
-    turn = normal[:, 1] * lever[:, 0] - normal[:, 0] * lever[:, 1]
-    jacobian = np.concatenate((normal, turn[:, None]), 1)
-    variance = np.einsum("si,sij,sj->s", jacobian, common_covariance[sources], jacobian).clip(0.0)
-    return np.bincount(station, variance, len(count)) / np.maximum(1, count)
+    variance = compute_lateral_variance(xy[station], tangent[station], pose[sources], common_covariance[sources])
+    return np.bincount(station, variance.clip(0.0), len(count)) / np.maximum(1, count)
+
+
+def compute_lateral_variance(xy: Floats, tangent: Floats, pose: Floats, covariance: Floats) -> Floats:
+    """Compute the variance (N,) across a line at xy with unit tangents (N, 2) by the covariance (N, 3, 3) of a pose (N, 3), m²."""
+    lever = xy - pose[:, :2]
+    normal = np.stack((-tangent[:, 1], tangent[:, 0]), 1)
+    jacobian = np.concatenate((normal, (normal[:, 1] * lever[:, 0] - normal[:, 0] * lever[:, 1])[:, None]), 1)
+    return np.einsum("ni,nij,nj->n", jacobian, covariance, jacobian)
 
 
 class _EvidenceStations(NamedTuple):

@@ -93,14 +93,13 @@ class JointPriors:
 
 @dataclass(frozen=True, eq=False)
 class JointStep:
-    """Result of one step: increments of the poses (O, 3), biases (S, 3), the weights of the priors of observations (O,) and of the
-    drives of the states (S,), and the factorized system, None where it was solved iteratively.
+    """Result of one step: increments of the poses (O, 3), biases (S, 3), weights (O,) of the priors of the observations' own
+    errors, and the factorized system, None where it was solved iteratively.
     """
 
     increment: Floats
     bias: Floats
-    look_weight: Floats
-    drive_weight: Floats
+    own_weight: Floats
     factor: SuperLU | None
 
 
@@ -108,12 +107,12 @@ def compute_prior_weights(priors: JointPriors, scale: float) -> tuple[Floats, Fl
     """Compute the Geman-McClure weights of each observation's own error (O,) and of each state's drive (S,); scale in sigmas."""
     own = np.linalg.inv((1.0 - priors.bias_fraction) * priors.covariance)
     error = priors.correction - priors.bias[priors.chain.state]
-    look = np.einsum("oi,oij,oj->o", error, own, error)
+    own_distance = np.einsum("oi,oij,oj->o", error, own, error)
     shared = _state_information(priors)
     start = priors.chain.start
     bias = priors.bias[start]
     drive = np.einsum("si,sij,sj->s", bias, shared[start], bias)
-    return _geman_mcclure(look, scale), _geman_mcclure(drive, scale)
+    return _geman_mcclure(own_distance, scale), _geman_mcclure(drive, scale)
 
 
 def _geman_mcclure(square: Floats, scale: float) -> Floats:
@@ -134,8 +133,8 @@ def solve_joint_step(pairs: PairBlocks, priors: JointPriors, scale: float, toler
 
     tolerance: relative residual of conjugate gradients, whose cost grows in proportion to the observations; None: by factors.
     """
-    look_weight, drive_weight = compute_prior_weights(priors, scale)
-    system, right_side = assemble_joint_system(pairs, priors, look_weight, drive_weight)
+    own_weight, drive_weight = compute_prior_weights(priors, scale)
+    system, right_side = assemble_joint_system(pairs, priors, own_weight, drive_weight)
     factor = None
     if tolerance is None:
         factor = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
@@ -143,7 +142,7 @@ def solve_joint_step(pairs: PairBlocks, priors: JointPriors, scale: float, toler
     else:
         found = _solve_iteratively(system, right_side, tolerance)
     count = 3 * len(priors.correction)
-    return JointStep(found[:count].reshape(-1, 3), found[count:].reshape(-1, 3), look_weight, drive_weight, factor)
+    return JointStep(found[:count].reshape(-1, 3), found[count:].reshape(-1, 3), own_weight, factor)
 
 
 def _solve_iteratively(system: csc_array, right_side: Floats, tolerance: float) -> Floats:
@@ -162,13 +161,13 @@ def _solve_iteratively(system: csc_array, right_side: Floats, tolerance: float) 
 
 
 def assemble_joint_system(
-    pairs: PairBlocks, priors: JointPriors, look_weight: Floats, drive_weight: Floats
+    pairs: PairBlocks, priors: JointPriors, own_weight: Floats, drive_weight: Floats
 ) -> tuple[csc_array, Floats]:
     """Assemble the normal equations: the increments of O poses first, then S biases, three unknowns each."""
     chain, count, states = priors.chain, len(priors.correction), len(priors.chain.previous)
     rows, state = np.arange(count), count + chain.state
     own_information = np.linalg.inv((1.0 - priors.bias_fraction) * priors.covariance)
-    own = (look_weight * priors.agent_weight)[:, None, None] * own_information
+    own = (own_weight * priors.agent_weight)[:, None, None] * own_information
     shared = _state_information(priors)
     at = count + np.arange(states)
     linked = chain.previous >= 0

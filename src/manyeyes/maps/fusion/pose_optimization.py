@@ -249,14 +249,13 @@ def _apply_step(
     limit = np.array([config.max_step_m, config.max_step_m, config.max_step_rad])
     increment = np.where(priors.fixed[:, None], 0.0, np.clip(solved.increment, -limit, limit))
     own_prior = np.linalg.inv((1.0 - config.drive_fraction) * whole.prior_covariance)
-    covariance = np.linalg.inv(blocks.own + solved.look_weight[:, None, None] * own_prior)
+    covariance = np.linalg.inv(blocks.own + solved.own_weight[:, None, None] * own_prior)
     covariance = (covariance + covariance.transpose(0, 2, 1)) / 2
     return replace(
         whole,
         pose=whole.pose + increment,
         covariance=np.where(priors.fixed[:, None, None], whole.prior_covariance, covariance),
         drive_bias=solved.bias[priors.chain.state],
-        look_weight=solved.look_weight,
         pairs=None,
     )
 

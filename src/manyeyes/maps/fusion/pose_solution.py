@@ -46,7 +46,6 @@ class PoseSolution:
     drive_bias: (O, 3) metres, metres, radians, estimated bias of the drive's prior poses here.
     scale: (O,) metres, robust residual scale of the agent's lines.
     agent_weight: (O,) in (0, 1], see :func:`~manyeyes.maps.fusion.joint_solver.estimate_agent_weights`.
-    look_weight: (O,) in (0, 1], weight of the prior of the observation's own error.
     is_surveyed: (O,) 1 for surveyed poles.
     pairs: sums of a step before its parts are merged, else None.
     """
@@ -64,7 +63,6 @@ class PoseSolution:
     drive_bias: Floats
     scale: Floats
     agent_weight: Floats
-    look_weight: Floats
     is_surveyed: Floats
     pairs: PairSums | None = field(default=None, kw_only=True)
 
@@ -111,7 +109,6 @@ _COLUMNS = (
     "drive_bias",
     "scale",
     "agent_weight",
-    "look_weight",
     "is_surveyed",
 )
 
@@ -149,7 +146,6 @@ def make_initial_solution(arrays: ObservationArrays) -> PoseSolution:
         drive_bias=np.zeros((count, 3)),
         scale=np.full(count, 0.2),
         agent_weight=np.ones(count),
-        look_weight=np.ones(count),
         is_surveyed=np.asarray(arrays.trusted).astype(np.float64),
     )
     return start.take(np.array(sorted(range(count), key=lambda k: arrays.ids[k]), np.int64))

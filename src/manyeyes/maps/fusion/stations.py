@@ -23,6 +23,7 @@ from manyeyes.maps.fusion.existence import (
     EvidenceConfig,
     EvidenceTable,
     accumulate_evidence,
+    compute_lateral_variance,
     find_covered_by_inliers,
 )
 from manyeyes.maps.fusion.mean_shift import RidgeConfig, mean_shift_to_ridges, thin_ridges
@@ -199,10 +200,7 @@ def _compute_point_weights(
 ) -> Floats:
     """Compute (P,) 1 / lateral variance by detection and pose, relative to POINT_VARIANCE_M2."""
     owner = arrays.observation_of_point
-    normal = np.stack((-tangent[:, 1], tangent[:, 0]), 1)
-    lever = xy - pose[owner, :2]
-    jacobian = np.concatenate((normal, (normal[:, 1] * lever[:, 0] - normal[:, 0] * lever[:, 1])[:, None]), 1)
-    spread = np.einsum("pi,pij,pj->p", jacobian, covariance[owner], jacobian)
+    spread = compute_lateral_variance(xy, tangent, pose[owner], covariance[owner])
     return POINT_VARIANCE_M2 / (arrays.sigma**2 + 0.1**2 + spread)
 
 
