@@ -11,12 +11,11 @@ import pytest
 from manyeyes.datatypes.map_element import BOUNDARY, DIVIDER, MapElements
 from manyeyes.maps.elements.observation import Observation
 from manyeyes.maps.fusion import pose_optimization
+from manyeyes.maps.fusion.agent_weights import AgentLimits, estimate_agent_weights
 from manyeyes.maps.fusion.joint_solver import (
-    AgentLimits,
     assemble_joint_system,
     compute_marginal_covariance,
     compute_prior_weights,
-    estimate_agent_weights,
     make_drive_chain,
     solve_joint_step,
 )

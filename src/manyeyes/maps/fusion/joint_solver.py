@@ -18,7 +18,6 @@ from scipy.sparse import bsr_array, coo_array, csc_array
 from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 
 from manyeyes._jit import F64x1, F64x3, I64x1, njit
-from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -264,55 +263,3 @@ def _gather_blocks(
                     if rows[k] == high:
                         out[o, i, j] = values[k]
                         break
-
-
-@dataclass(frozen=True)
-class AgentLimits:
-    """What the mean correction of an agent means, all but the last in standard deviations.
-
-    tolerance: up to it the weight is 1; an honest agent's bias moves its poses, not its weight. scale: of the Geman-McClure weight
-    beyond. rejection: from it on the agent is rejected. bias_fraction: fraction of the prior variance that is common to a drive.
-    """
-
-    tolerance: float
-    scale: float
-    rejection: float
-    bias_fraction: float
-
-
-def estimate_agent_weights(
-    offset: Floats, observability: Floats, prior_variance: Floats, agent: Ints, limits: AgentLimits
-) -> Floats:
-    """Estimate agent weights (O,) in (0, 1] from the mean correction of each agent's prior poses (robust M-estimation).
-
-    The mean over an agent's observations is used because independent noise averages out, while a bias or an attack does not.
-    Only observable directions count.
-
-    Args:
-        offset: (O, 2) metres, correction of each observation relative to those nearby.
-        observability: (O, 2, 2), see :func:`compute_observability`.
-        prior_variance: (O,) m², mean variance of the prior position.
-        agent: (O,) agent of each observation, from 0.
-        limits: see :class:`AgentLimits`.
-    """
-    count = int(agent.max(initial=-1)) + 1
-    weight, pull, prior_sum, num_observations = (
-        np.zeros((count, 2, 2)),
-        np.zeros((count, 2)),
-        np.zeros(count),
-        np.zeros(count),
-    )
-    np.add.at(weight, agent, observability)
-    np.add.at(pull, agent, np.einsum("oij,oj->oi", observability, offset))
-    np.add.at(prior_sum, agent, prior_variance)
-    np.add.at(num_observations, agent, 1.0)
-    mean = np.linalg.solve(weight + 0.1 * np.eye(2), pull[:, :, None])[:, :, 0]
-    spread = (
-        prior_sum
-        / num_observations
-        * (1.0 + limits.bias_fraction * (np.trace(weight, axis1=1, axis2=2) / 2 - 1.0).clip(0.0))
-    )
-    distance = np.einsum("ai,aij,aj->a", mean, weight, mean).clip(0.0) / np.maximum(spread, 1e-12)
-    distance = np.sqrt(distance)
-    beyond = (distance - limits.tolerance).clip(0.0)
-    return np.where(distance > limits.rejection, REJECTED_WEIGHT, _geman_mcclure(beyond**2, limits.scale))[agent]

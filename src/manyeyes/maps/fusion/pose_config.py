@@ -53,6 +53,8 @@ class PoseSolverConfig:
     max_observations_per_cell: observations that count per cell of 8 m, class and heading.
     drive_fraction: fraction of the prior variance that is common to a drive. drift_length_m: distance after which the random
         walk of a drive's bias has that variance again. max_drive_gap_m: longer gaps end a drive.
+    domain_m, domain_halo_m: the ground is divided into squares of this side, the origin in the middle of one; the poses in one are
+        solved with all that lie within the halo around it, and what lies farther away stays where it is during a step.
     agent_tolerance, agent_scale, max_agent_error: of an agent's mean correction, in standard deviations: up to the first its weight
         is 1, then it falls with this Geman-McClure scale, and beyond the last the agent is rejected.
     observation_error_m: standard deviation of corrections beside that of the prior pose, from errors that all lines of an
@@ -84,6 +86,8 @@ class PoseSolverConfig:
     drive_fraction: float = 0.5
     drift_length_m: float = 2400.0
     max_drive_gap_m: float = 300.0
+    domain_m: float = 1536.0
+    domain_halo_m: float = 384.0
     agent_tolerance: float = 1.6
     agent_scale: float = 0.8
     max_agent_error: float = 2.5

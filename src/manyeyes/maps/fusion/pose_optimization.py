@@ -15,9 +15,10 @@ others.
 
 The association and the sums of an observation depend only on observations that overlap it. So a large area is handled tile by
 tile with the same result: :func:`search_coarse_poses` and each :func:`run_step` run for the home observations of each tile, given
-all observations that :func:`find_overlapping` returns and the poses after the previous step. :func:`merge_solutions` joins the
-sums of the tiles and solves. :func:`solve_poses` is the case of one tile. The map is defined as the result of the fixed number of
-steps.
+all observations that :func:`find_overlapping` returns and the poses after the previous step. A joint step is solved domain by
+domain (:func:`solve_domain`), squares of 1,536 m with a halo of 384 m, so that no process holds the poses of a city; only agents
+are weighed over all of it, from sums (:mod:`manyeyes.maps.fusion.agent_weights`). :func:`merge_solutions` does both in memory, and
+:func:`solve_poses` is the case of one tile. The map is defined as the result of the fixed number of steps with this halo.
 """
 
 from __future__ import annotations
@@ -29,21 +30,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes.maps.elements.observation import Observation
+from manyeyes.maps.fusion.agent_weights import (
+    NUM_COLUMNS,
+    AgentLimits,
+    AgentSums,
+    AgentTable,
+    apply_agents,
+    make_agent_columns,
+)
 from manyeyes.maps.fusion.coarse_search import search_coarse
 from manyeyes.maps.fusion.joint_solver import (
-    AgentLimits,
     JointPriors,
     JointStep,
     PairBlocks,
     compute_marginal_covariance,
-    estimate_agent_weights,
     make_drive_chain,
     solve_joint_step,
 )
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays, to_observation_arrays
 from manyeyes.maps.fusion.pair_system import OtherPoints, OwnPoints, PairLimits, sum_pairs
 from manyeyes.maps.fusion.point_grid import build_grid, cell_key, limit_observations
-from manyeyes.maps.fusion.pose_config import DEFAULT_ALIGN, JointIteration, PoseSolverConfig
+from manyeyes.maps.fusion.pose_config import DEFAULT_ALIGN, JointIteration, PoseSolverConfig, SolverStep
 from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT, PairSums, PoseSolution, make_initial_solution
 
 Floats = NDArray[np.float64]
@@ -199,29 +206,109 @@ def merge_solutions(
     step = None if number is None else config.schedule[number]
     if step is None or step.joint is None or whole.pairs is None or not len(whole.ids):
         return replace(whole, pairs=None)
-    blocks = _assemble_blocks(whole.pairs, whole.ids)
-    priors = _make_priors(whole, config)
+    states: list[PoseSolution] = []
+    sums: list[AgentSums] = []
+    rows, solved = np.zeros(0, np.int64), None
+    for domain in list_domains(whole.prior_pose, config):
+        near = _rows_near_domain(whole, domain, config)
+        if solved is None or not np.array_equal(near, rows):
+            rows, solved = near, _solve_near(whole.take_with_pairs(near), step, config)
+        state, found = _select_domain(*solved, domain, config)
+        states.append(state)
+        sums.append(found)
+    table = weigh_agents(AgentSums.merge(sums), AgentTable.of_state(whole), step, config)
+    return apply_agents(PoseSolution.cat(states), table)
+
+
+def list_domains(prior_pose: Floats, config: PoseSolverConfig = DEFAULT_ALIGN) -> list[tuple[int, int]]:
+    """Return the domains (column, row) that hold prior poses (O, 3), ascending."""
+    return [(int(x), int(y)) for x, y in np.unique(_domain_indices(prior_pose, config), axis=0)]
+
+
+def _domain_indices(prior_pose: Floats, config: PoseSolverConfig) -> Ints:
+    return np.floor(prior_pose[:, :2] / config.domain_m + 0.5).astype(np.int64)
+
+
+def find_domain_area(domain: tuple[int, int], config: PoseSolverConfig) -> tuple[float, float, float, float]:
+    """Return the area (x0, y0, x1, y1; metres) of a domain with its halo; the origin is the middle of domain (0, 0)."""
+    reach = config.domain_m / 2 + config.domain_halo_m
+    x, y = (d * config.domain_m for d in domain)
+    return x - reach, y - reach, x + reach, y + reach
+
+
+def solve_domain(
+    parts: Sequence[PoseSolution], domain: tuple[int, int], step: SolverStep, config: PoseSolverConfig = DEFAULT_ALIGN
+) -> tuple[PoseSolution, AgentSums]:
+    """Solve a joint step for the poses in one domain; a pure function of the observations within its halo.
+
+    Observations beyond the halo do not move during the step, and a drive is cut there. Each step starts from the poses that all
+    domains had after the previous one (restricted additive Schwarz).
+
+    Args:
+        parts: disjoint parts with their pairs, which together hold all observations within the halo.
+        domain: column and row.
+
+    Returns:
+        The observations of the domain, ids ascending, and the sums of their agents.
+    """
+    whole = PoseSolution.cat(parts)
+    near = whole.take_with_pairs(_rows_near_domain(whole, domain, config))
+    if not len(near.ids):
+        return near, AgentSums.of((), np.zeros((0, NUM_COLUMNS)))
+    return _select_domain(*_solve_near(near, step, config), domain, config)
+
+
+def _rows_near_domain(whole: PoseSolution, domain: tuple[int, int], config: PoseSolverConfig) -> Ints:
+    """Return the rows whose prior position lies in a domain or within its halo."""
+    area, place = find_domain_area(domain, config), whole.prior_pose[:, :2]
+    return np.flatnonzero(((place >= area[:2]) & (place < area[2:])).all(1))
+
+
+def _select_domain(
+    state: PoseSolution, columns: Floats, domain: tuple[int, int], config: PoseSolverConfig
+) -> tuple[PoseSolution, AgentSums]:
+    """Return the observations of a domain, and the sums of their agents of columns (O, 9)."""
+    home = np.flatnonzero((_domain_indices(state.prior_pose, config) == domain).all(1))
+    at_home = state.take(home)
+    return at_home, AgentSums.of(at_home.agents, columns[home])
+
+
+def _solve_near(near: PoseSolution, step: SolverStep, config: PoseSolverConfig) -> tuple[PoseSolution, Floats]:
+    """Solve a joint step for these observations; their state, and what each adds to the sums of its agent (O, 9)."""
+    assert step.joint is not None and near.pairs is not None
+    blocks = _assemble_blocks(near.pairs, near.ids)
+    priors = _make_priors(near, config)
     # The last step is solved by factors, which give the covariance, too.
     solved = solve_joint_step(blocks, priors, step.joint.prior_scale, None if step.is_last else STEP_TOLERANCE)
-    state = replace(_apply_step(whole, blocks, priors, solved, config), scale=_estimate_scale(whole, whole.pairs))
-    state = _weigh_agents(state, blocks.own, step.decides, config)
+    state = _apply_step(near, blocks, priors, solved, config)
     if solved.factor is not None:
-        marginal = compute_marginal_covariance(solved.factor, len(whole.ids))
-        marginal[priors.fixed] = whole.prior_covariance[priors.fixed]
+        marginal = compute_marginal_covariance(solved.factor, len(near.ids))
+        marginal[priors.fixed] = near.prior_covariance[priors.fixed]
         state = replace(state, common_covariance=marginal - state.covariance)
-    return state
+    return state, _make_columns(state, blocks.own, near.pairs, config)
+
+
+def weigh_agents(
+    sums: AgentSums, previous: AgentTable | None, step: SolverStep, config: PoseSolverConfig = DEFAULT_ALIGN
+) -> AgentTable:
+    """Weigh all agents after a joint step."""
+    limits = AgentLimits(config.agent_tolerance, config.agent_scale, config.max_agent_error, config.drive_fraction)
+    return AgentTable.of_sums(sums, previous, step.decides, limits)
 
 
 def _assemble_blocks(pairs: PairSums, ids: Sequence[str]) -> PairBlocks:
-    """Assemble the sums of all observations, whose ids ascend."""
+    """Assemble the sums of observations, whose ids ascend; others that they form pairs with stay where they are."""
     # Fixed lengths compare as integers do; ids ascend, so rows are found by bisection.
     digests = np.ascontiguousarray(pairs.other_ids).view("S16").ravel()
-    b = np.searchsorted(np.frombuffer(bytes.fromhex("".join(ids)), "S16"), digests)
+    known = np.frombuffer(bytes.fromhex("".join(ids)), "S16")
+    b = np.searchsorted(known, digests)
+    inside = known[np.minimum(b, len(known) - 1)] == digests
+    a = np.repeat(np.arange(len(ids)), np.diff(pairs.offsets))[inside]
+    b, shared = b[inside], pairs.shared[inside]
     own, right_side = pairs.own[:, _SYMMETRIC].reshape(-1, 3, 3), pairs.own[:, 6:9].copy()
-    np.add.at(own, b, pairs.shared[:, 9:15][:, _SYMMETRIC].reshape(-1, 3, 3))
-    np.add.at(right_side, b, pairs.shared[:, 15:18])
-    a = np.repeat(np.arange(len(ids)), np.diff(pairs.offsets))
-    return PairBlocks(own, right_side, a, b, pairs.shared[:, :9].reshape(-1, 3, 3))
+    np.add.at(own, b, shared[:, 9:15][:, _SYMMETRIC].reshape(-1, 3, 3))
+    np.add.at(right_side, b, shared[:, 15:18])
+    return PairBlocks(own, right_side, a, b, shared[:, :9].reshape(-1, 3, 3))
 
 
 def _make_priors(whole: PoseSolution, config: PoseSolverConfig) -> JointPriors:
@@ -260,35 +347,18 @@ def _apply_step(
     )
 
 
-def _estimate_scale(whole: PoseSolution, pairs: PairSums) -> Floats:
-    """Estimate the residual scale (O,) of each observation's agent in metres."""
-    agent = np.unique(np.array(whole.agents), return_inverse=True)[1]
-    # A prior of 20 points keeps the scale of an agent without matches at 0.2 m.
-    variance = (np.bincount(agent, pairs.own[:, 9]) + 20.0 * 0.04) / (np.bincount(agent, pairs.own[:, 10]) + 20.0)
-    return np.sqrt(variance)[agent]
-
-
-def _weigh_agents(state: PoseSolution, information: Floats, decides: bool, config: PoseSolverConfig) -> PoseSolution:
-    """Update the weights of agents, whose lines give information (O, 3, 3); only a step that decides rejects or reinstates."""
-    agent = np.unique(np.array(state.agents), return_inverse=True)[1]
+def _make_columns(state: PoseSolution, information: Floats, pairs: PairSums, config: PoseSolverConfig) -> Floats:
+    """Make what each observation, whose lines give information (O, 3, 3), adds to the sums of its agent: (O, 9)."""
     prior = np.linalg.inv(state.prior_covariance)
     ratio = (np.linalg.inv(information + prior) @ prior)[:, :2, :2]
     variance = np.trace(state.prior_covariance[:, :2, :2], axis1=1, axis2=2) / 2
-    weight = estimate_agent_weights(
+    return make_agent_columns(
         state.correction[:, :2],
         np.eye(2) - (ratio + ratio.transpose(0, 2, 1)) / 2,
         variance + config.observation_error_m**2,
-        agent,
-        AgentLimits(
-            config.agent_tolerance,
-            config.agent_scale,
-            config.max_agent_error if decides else np.inf,
-            config.drive_fraction,
-        ),
+        pairs.own[:, 9],
+        pairs.own[:, 10],
     )
-    stays_rejected = (state.agent_weight <= REJECTED_WEIGHT) & (not decides)
-    weight = np.where(stays_rejected, REJECTED_WEIGHT, weight)
-    return replace(state, agent_weight=np.where(state.is_surveyed > 0, 1.0, weight))
 
 
 def limit_per_cell(arrays: ObservationArrays, pose: Floats, max_observations: int) -> NDArray[np.bool_]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes.datatypes.map_element import take_rows
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays
 
 Floats = NDArray[np.float64]
@@ -45,7 +46,7 @@ class PoseSolution:
         the marginal covariance adds, which observations nearby share.
     drive_bias: (O, 3) metres, metres, radians, estimated bias of the drive's prior poses here.
     scale: (O,) metres, robust residual scale of the agent's lines.
-    agent_weight: (O,) in (0, 1], see :func:`~manyeyes.maps.fusion.joint_solver.estimate_agent_weights`.
+    agent_weight: (O,) in (0, 1], see :func:`~manyeyes.maps.fusion.agent_weights.estimate_agent_weights`.
     is_surveyed: (O,) 1 for surveyed poles.
     pairs: sums of a step before its parts are merged, else None.
     """
@@ -85,6 +86,14 @@ class PoseSolution:
             columns[name] = tuple(getattr(self, name)[k] for k in rows.tolist())
         return PoseSolution(**columns)
 
+    def take_with_pairs(self, rows: Ints) -> PoseSolution:
+        """Return the chosen rows with their pairs, also those with observations that are left out."""
+        return replace(self.take(rows), pairs=None if self.pairs is None else _take_pairs(self.pairs, rows))
+
+    def with_agents(self, agent_weight: Floats, scale: Floats) -> PoseSolution:
+        """Return the same with the weight (O,) and the residual scale (O,) of each observation's agent."""
+        return replace(self, agent_weight=agent_weight, scale=scale)
+
     @classmethod
     def cat(cls, parts: Sequence[PoseSolution]) -> PoseSolution:
         """Concatenate disjoint parts, ids ascending, with their pairs if all have them."""
@@ -94,8 +103,8 @@ class PoseSolution:
         joined = cls(**columns)
         order = np.array(sorted(range(len(joined.ids)), key=lambda k: joined.ids[k]), np.int64)
         sums = [part.pairs for part in parts if part.pairs is not None]
-        pairs = _concatenate_pairs(sums, order) if len(sums) == len(parts) else None
-        return replace(joined.take(order), pairs=pairs)
+        pairs = _concatenate_pairs(sums) if len(sums) == len(parts) else None
+        return replace(joined, pairs=pairs).take_with_pairs(order)
 
 
 _COLUMNS = (
@@ -113,19 +122,20 @@ _COLUMNS = (
 )
 
 
-def _concatenate_pairs(parts: Sequence[PairSums], order: Ints) -> PairSums:
-    """Concatenate the pairs of parts, then take the observations in an order."""
+def _concatenate_pairs(parts: Sequence[PairSums]) -> PairSums:
     sizes = np.concatenate([np.diff(part.offsets) for part in parts])
-    starts = np.concatenate(([0], np.cumsum(sizes)))[:-1][order]
-    sizes = sizes[order]
-    offsets = np.concatenate(([0], np.cumsum(sizes))).astype(np.int64)
-    places = np.arange(offsets[-1]) + np.repeat(starts - offsets[:-1], sizes)
     return PairSums(
-        np.concatenate([part.own for part in parts])[order],
-        offsets,
-        np.concatenate([part.other_ids for part in parts])[places],
-        np.concatenate([part.shared for part in parts])[places],
+        np.concatenate([part.own for part in parts]),
+        np.concatenate(([0], np.cumsum(sizes))).astype(np.int64),
+        np.concatenate([part.other_ids for part in parts]),
+        np.concatenate([part.shared for part in parts]),
     )
+
+
+def _take_pairs(pairs: PairSums, order: Ints) -> PairSums:
+    """Return the pairs of the chosen observations, in the order given."""
+    offsets, places = take_rows(pairs.offsets, order)
+    return PairSums(pairs.own[order], offsets, pairs.other_ids[places], pairs.shared[places])
 
 
 def make_initial_solution(arrays: ObservationArrays) -> PoseSolution:
