@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cost of map fusion, in four measurements.
+"""Cost of map fusion, in five measurements.
 
 literal  our fusion against the paper's literal pipeline with pycpd, per observation, in turn in one process (bar: 50 times)
 stream   one observation of about 25 elements taken into a map of 100,000 elements (bar: 10 ms)
 city     a growing city, 10^4, 10^5, 10^6 observed elements, from the log to a release (bar at 10^6, two cores: 20 min, 8 GB)
 engines  10^5 observed elements inline, over processes, Dask and Ray: the map must be identical
+driver   memory of the process that drives a fusion, 10^4 to 10^7 observed elements; workers are stand-ins, no step is run
 
 Observations are simulated before the clock starts. Besides wall time the processors' own time is given, which a busy
-machine does not change; memory is the largest sum of resident memory over this process and its workers, sampled four times
-a second, shared pages counted for each.
+machine does not change; memory is the largest sum of resident memory over this process and its workers, and that of the largest
+worker, sampled four times a second, shared pages counted for each. That of the driver is the peak of what Python and NumPy allocate
+in it while it fuses and publishes (tracemalloc).
 
-python benchmarks/map_fusion.py literal|stream|city|engines [--elements 10000 ...] [--workers 2] [--out FILE.json]
+python benchmarks/map_fusion.py literal|stream|city|engines|driver [--elements 10000 ...] [--workers 2] [--out FILE.json]
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+import tracemalloc
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,17 +40,20 @@ from manyeyes.maps.baselines import crowdmap_literal
 from manyeyes.maps.baselines.cpd import CpdConfig
 from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
-from manyeyes.maps.fusion.fuse import fuse
+from manyeyes.maps.fusion.fuse import MapFusionConfig, fuse
 from manyeyes.maps.fusion.incremental import IncrementalMap
 from manyeyes.maps.store.executors import make_executor
+from manyeyes.maps.store.log_index import IndexRow, LogIndex
 from manyeyes.maps.store.store import MapStore
-from manyeyes.maps.store.tiled_fusion import TiledFusionConfig
+from manyeyes.maps.store.tiled_fusion import FusionJob, StepResult, StepTask, TiledFusionConfig, fuse_and
 from manyeyes.ops.polyline import close_rings, resample
 from manyeyes.ops.polyline_distance import chamfer_distance
 from manyeyes.simulator.fleet import CROWDS, CrowdConfig, load_place, simulate_crowd
 from manyeyes.studies.provenance import write_json
 
 CITY = replace(CROWDS["local"], range_x_m=(-45.0, 45.0), range_y_m=(-25.0, 25.0))
+# Of the simulated city of 10^5 elements.
+ELEMENTS_PER_OBSERVATION, OBSERVATIONS_PER_KM2 = 20.3, 3600.0
 LITERAL_BAR, STREAM_BAR_MS, CITY_BAR_S, CITY_BAR_GB = 50.0, 10.0, 1200.0, 8.0
 
 
@@ -80,7 +86,9 @@ class Stream:
 
 @dataclass(frozen=True)
 class City:
-    """One size: observations, observed elements, seconds to ingest and to fuse and publish, processor time, peak memory."""
+    """One size: observations, observed elements, seconds to ingest and to fuse and publish, processor time, peak memory of all
+    processes and of the largest worker; of the driver what it allocated.
+    """
 
     executor: str
     observations: int
@@ -91,7 +99,21 @@ class City:
     fuse_s: float
     fuse_cpu_s: float
     peak_gb: float
+    worker_gb: float
+    driver_mb: float
     load: float
+
+
+@dataclass(frozen=True)
+class Driver:
+    """One size: observations, elements that they stand for, blocks, steps that were given out, peak of the driver's memory."""
+
+    observations: int
+    elements: int
+    blocks: int
+    tasks: int
+    driver_mb: float
+    seconds: float
 
 
 class _Registered:
@@ -222,7 +244,10 @@ def city(elements: int, engine: str, workers: int, crowd: Sequence[Observation],
                 log.append(crowd)
             ingested = time.perf_counter()
             cpu = _all_cpu()
+            tracemalloc.start()
             made = store.fuse(None, TiledFusionConfig(), make_executor(engine, workers), _report_progress)
+            driver_mb = tracemalloc.get_traced_memory()[1] / 1e6
+            tracemalloc.stop()
             cpu = _all_cpu() - cpu
             ended = time.perf_counter()
         return City(
@@ -234,9 +259,61 @@ def city(elements: int, engine: str, workers: int, crowd: Sequence[Observation],
             ingested - began,
             ended - ingested,
             cpu,
-            peak[0],
+            *peak,
+            driver_mb,
             load,
         )
+
+
+class _NoWork:
+    """An object store that keeps nothing, and an engine whose workers return names at once."""
+
+    location = "nowhere"
+
+    def __init__(self) -> None:
+        self.blocks, self.tasks = 0, 0
+
+    def list(self, _: str) -> list[str]:
+        """No objects."""
+        return []
+
+    def put(self, _: str, __: bytes, durable: bool = True) -> None:
+        """Count a block that is planned."""
+        self.blocks += 1
+
+    def delete(self, _: Sequence[str]) -> None:
+        """Nothing is there."""
+
+    def run(self, _: object, tasks: Iterable[StepTask]) -> Iterator[tuple[int, StepResult]]:
+        """Names such as a worker would return."""
+        for index, task in enumerate(tasks):
+            self.tasks += 1
+            names = ("poses", "sums") if task.kind == "solve" else ("poses",)
+            yield index, StepResult(tuple(f"{task.folder}/{task.digest}-{task.digest}.{name}" for name in names))
+
+
+def driver(elements: int, seed: int) -> Driver:
+    """Drive a fusion of observations as dense as those of the city, on a square that grows with their number."""
+    count = round(elements / ELEMENTS_PER_OBSERVATION)
+    side = 1000.0 * float(np.sqrt(count / OBSERVATIONS_PER_KM2))
+    rng = np.random.default_rng(seed)
+    with tempfile.TemporaryDirectory() as folder:
+        index = LogIndex(Path(folder) / "catalogue.sqlite")
+        index.clear("")
+        for first in range(0, count, 10_000):
+            xy = rng.uniform(0.0, side, (min(10_000, count - first), 2)).tolist()
+            rows = [
+                IndexRow(rng.bytes(16).hex(), k // 128, k, f"car{k % 977}", x, y, 51.0, "p")
+                for k, (x, y) in enumerate(xy)
+            ]
+            index.add_segment(f"{first:08d}.parquet", rows)
+        began, nowhere = time.perf_counter(), _NoWork()
+        job = FusionJob(nowhere, nowhere, MapFusionConfig())
+        tracemalloc.start()
+        fuse_and(len, job, index, TiledFusionConfig(), nowhere)
+        driver_mb = tracemalloc.get_traced_memory()[1] / 1e6
+        tracemalloc.stop()
+        return Driver(count, elements, nowhere.blocks, nowhere.tasks, driver_mb, time.perf_counter() - began)
 
 
 def city_crowd(elements: int, seed: int) -> tuple[tuple[Observation, ...], MapFrame]:
@@ -284,18 +361,18 @@ def _all_cpu() -> float:
 
 @contextmanager
 def _peak() -> Iterator[list[float]]:
-    """The largest resident memory in GB, once the block has ended."""
-    max_gb, ended = [0.0], threading.Event()
+    """The largest resident memory in GB, of all processes and of one worker, once the block has ended."""
+    max_gb, ended = [0.0, 0.0], threading.Event()
 
     def sample_memory() -> None:
         while not ended.wait(0.25):
-            total = 0
+            sizes = []
             for process in _family():
                 try:
-                    total += process.memory_info().rss
+                    sizes.append(process.memory_info().rss / 1e9)
                 except psutil.NoSuchProcess:
                     continue
-            max_gb[0] = max(max_gb[0], total / 1e9)
+            max_gb[:] = max(max_gb[0], sum(sizes)), max(max_gb[1], *sizes[1:], 0.0)
 
     thread = threading.Thread(target=sample_memory, daemon=True)
     thread.start()
@@ -317,7 +394,7 @@ def _cities(sizes: Sequence[int], engines: Sequence[str], workers: int, seed: in
             print(
                 f"{engine}: {row.observations} observations, {row.elements} elements -> {row.map_elements}, {row.map_hash}: "
                 f"ingest {row.ingest_s:.1f} s, fuse and publish {row.fuse_s:.1f} s ({row.fuse_cpu_s:.1f} s of processors), "
-                f"{row.peak_gb:.2f} GB, load before {row.load:.1f}",
+                f"{row.peak_gb:.2f} GB, largest worker {row.worker_gb:.2f} GB, driver {row.driver_mb:.1f} MB, load {row.load:.1f}",
                 flush=True,
             )
     return rows
@@ -325,7 +402,7 @@ def _cities(sizes: Sequence[int], engines: Sequence[str], workers: int, seed: in
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", nargs="?", default="stream", choices=("literal", "stream", "city", "engines"))
+    parser.add_argument("what", nargs="?", default="stream", choices=("literal", "stream", "city", "engines", "driver"))
     parser.add_argument("--elements", type=int, nargs="+")
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--rounds", type=int, default=3)
@@ -352,6 +429,15 @@ def main() -> None:
                 f"{live.most_ms:.2f}); bar {STREAM_BAR_MS:.0f} ms {_met(live.met)}"
             )
             rows.append(live)
+    elif wanted.what == "driver":
+        for size in wanted.elements or [10_000, 100_000, 1_000_000, 10_000_000]:
+            held = driver(size, wanted.seed)
+            print(
+                f"{held.elements} elements, {held.observations} observations: {held.blocks} blocks, {held.tasks} steps, driver "
+                f"{held.driver_mb:.1f} MB, {held.seconds:.0f} s",
+                flush=True,
+            )
+            rows.append(held)
     elif wanted.what == "city":
         cities = _cities(wanted.elements or [10_000, 100_000, 1_000_000], ["process"], wanted.workers, wanted.seed)
         for one in cities:
@@ -366,12 +452,32 @@ def main() -> None:
         rows = list(cities)
     if wanted.out:
         settings = {"what": wanted.what, "workers": wanted.workers, "load": os.getloadavg()[0]}
-        write_json(
-            wanted.out,
-            {"command": shlex.join(["python", *sys.argv]), "settings": settings, "rows": rows},
-            settings,
-            wanted.seed,
-        )
+        command = shlex.join(["python", *sys.argv])
+        result = {"command": command, "study": f"map-{wanted.what}", "settings": settings, "costs": rows}
+        write_json(wanted.out, {**result, "tables": _make_tables(rows)}, settings, wanted.seed)
+
+
+def _make_tables(rows: Sequence[object]) -> list[dict[str, object]]:
+    """Tables for documents of the sizes of a city, and of what drives it."""
+    cities, drivers = [r for r in rows if isinstance(r, City)], [r for r in rows if isinstance(r, Driver)]
+    out: list[dict[str, object]] = []
+    if cities:
+        headings = ("observed elements", "observations", "engine", "fuse and publish [s]", "processor time [s]", "map elements",
+                    "driver [MB]", "largest worker [GB]", "all processes [GB]", "load")  # fmt: skip
+        lines = [
+            (f"{r.elements:,}", f"{r.observations:,}", r.executor, f"{r.fuse_s:.0f}", f"{r.fuse_cpu_s:.0f}", f"{r.map_elements:,}",
+             f"{r.driver_mb:.1f}", f"{r.worker_gb:.2f}", f"{r.peak_gb:.2f}", f"{r.load:.1f}")
+            for r in cities
+        ]  # fmt: skip
+        out.append({"title": "City", "headings": headings, "lines": lines})
+    if drivers:
+        headings = ("observed elements", "observations", "blocks", "steps given out", "driver [MB]")
+        lines = [
+            (f"{r.elements:,}", f"{r.observations:,}", f"{r.blocks:,}", f"{r.tasks:,}", f"{r.driver_mb:.1f}")
+            for r in drivers
+        ]
+        out.append({"title": "Driver", "headings": headings, "lines": lines})
+    return out
 
 
 def _met(met: bool) -> str:

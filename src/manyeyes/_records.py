@@ -28,20 +28,40 @@ def save_record(path: Path, value: object, durable: bool = False) -> None:
 
     Fields are numbers, texts, enumerations, None, arrays, tensors, tuples of these, and such dataclasses or named tuples again.
     """
+    atomic_write(path, *_chunks_of(value), durable=durable)
+
+
+def pack_record(value: object) -> bytes:
+    """Return the bytes of the file that :func:`save_record` writes."""
+    return b"".join(_chunks_of(value))
+
+
+def _chunks_of(value: object) -> list[bytes | memoryview]:
     arrays: list[np.ndarray] = []
     header = json.dumps(_pack(value, arrays)).encode()
-    chunks = (_bytes_of(array) for array in arrays if array.size)
-    atomic_write(path, b"%08x" % zlib.crc32(header), header, b"\n", *chunks, durable=durable)
+    return [b"%08x" % zlib.crc32(header), header, b"\n", *(_bytes_of(array) for array in arrays if array.size)]
 
 
 def load_record(path: Path, kind: type[T]) -> T | None:
     """Read the value of a file of :func:`save_record`; None where there is no such file, a damaged one, or one of another type."""
     try:
         with path.open("rb") as file:
-            checksum, header = file.read(8), file.readline()[:-1]
-            if int(checksum, 16) != zlib.crc32(header):
-                return None
-            return _unpack(kind, json.loads(header), file)
+            return _read_record(file, kind)
+    except OSError:
+        return None
+
+
+def unpack_record(data: bytes, kind: type[T]) -> T | None:
+    """Return the value of bytes of :func:`pack_record`; None for damaged ones, or ones of another type."""
+    return _read_record(io.BytesIO(data), kind)
+
+
+def _read_record(file: io.BufferedIOBase, kind: type[T]) -> T | None:
+    try:
+        checksum, header = file.read(8), file.readline()[:-1]
+        if int(checksum, 16) != zlib.crc32(header):
+            return None
+        return _unpack(kind, json.loads(header), file)
     except (OSError, ValueError, TypeError, EOFError, AttributeError):
         return None
 

@@ -9,7 +9,14 @@ import time
 import pytest
 
 from manyeyes.datatypes import ConfigError, MissingExtraError
-from manyeyes.maps.store.executors import InlineExecutor, ProcessExecutor, make_executor, map_blocks
+from manyeyes.maps.store.executors import (
+    BLOCKS_PER_WORKER,
+    DaskExecutor,
+    InlineExecutor,
+    ProcessExecutor,
+    make_executor,
+    map_blocks,
+)
 
 
 def _square_late(value: int) -> tuple[int, int]:
@@ -31,7 +38,7 @@ def _run(executor, fn, blocks, progress=None):
 
 def test_a_process_pool_gives_the_inline_list_in_block_order_and_reports_every_block():
     seen: list[tuple[int, int]] = []
-    with ProcessExecutor(2, queued_per_worker=1).open() as runner:
+    with ProcessExecutor(2).open() as runner:
         results = map_blocks(_square_late, range(9), runner, lambda done, total: seen.append((done, total)))
         again = map_blocks(_square_late, range(3), runner)
         with pytest.raises(ValueError, match="block three"):
@@ -40,6 +47,21 @@ def test_a_process_pool_gives_the_inline_list_in_block_order_and_reports_every_b
     assert os.getpid() not in {pid for _, pid in results}
     assert {pid for _, pid in again} <= {pid for _, pid in results}
     assert seen == [(k, 9) for k in range(1, 10)]
+
+
+@pytest.mark.parametrize("executor", [InlineExecutor(), ProcessExecutor(2)], ids=["inline", "process"])
+def test_blocks_are_taken_as_workers_become_free(executor):
+    taken: list[int] = []
+
+    def blocks():
+        for k in range(40):
+            taken.append(k)
+            yield k
+
+    with executor.open() as session:
+        for done, (index, _) in enumerate(session.run(_square_late, blocks())):
+            assert index in taken and len(taken) - done <= 2 * BLOCKS_PER_WORKER
+    assert len(taken) == 40 and done == 39
 
 
 def test_an_exception_of_a_block_reaches_the_caller_inline():
@@ -97,6 +119,12 @@ def test_a_ray_cluster_is_ended_by_the_process_that_began_it(monkeypatch, fails)
             if fails:
                 raise KeyError
         assert fake.calls == wanted
+
+
+def test_an_address_is_of_a_cluster():
+    assert make_executor("dask", 2, "tcp://a:1") == DaskExecutor("tcp://a:1", 2)
+    with pytest.raises(ConfigError, match=r"has no address; choose dask or ray for tcp://a:1"):
+        make_executor("process", address="tcp://a:1")
 
 
 def test_an_unknown_executor_lists_the_known_ones():

@@ -143,7 +143,7 @@ def agents_of_solutions(solutions, *_) -> list[str]:
         ("search_coarse_poses", agents_of_arrays),
         ("run_step", agents_of_arrays),
         ("build_stations", agents_of_arrays),
-        ("merge_solutions", agents_of_solutions),
+        ("solve_domain", agents_of_solutions),
     ],
 )
 def test_a_store_quarantines_what_a_tile_fails_with(step, agents_of, tmp_path, monkeypatch) -> None:

@@ -20,7 +20,8 @@ from manyeyes.maps.elements.observation_limits import LIMITS
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.formats.attributes import to_hex_ids
 from manyeyes.maps.store.map_diff import apply_delta, compute_delta, compute_home_tiles, transfer_ids
-from manyeyes.maps.store.observation_log import StoreError, hold_lock, read_active
+from manyeyes.maps.store.object_store import StoreError, hold_lock
+from manyeyes.maps.store.observation_log import read_active
 from manyeyes.maps.store.store import MapStore, compute_watermark
 
 pytest.importorskip("pyarrow", reason="the map extra is not installed")
@@ -54,7 +55,7 @@ def test_the_log_stores_each_observation_once_and_round_trips(tmp_path):
     assert len(list((tmp_path / "s/log").iterdir())) == 2
     assert standing.ids == tuple(sorted(o.id for o in many))
     rows = np.flatnonzero(standing.xy[:, 0] > 7000)
-    got = read_active(tmp_path / "s/log", standing, rows)
+    got = read_active(store.objects, standing, rows)
     want = sorted((o for o in many if o.pose[0] > 7000), key=lambda o: o.id)
     assert [o.id for o in got] == [o.id for o in want] and len(want) == 124
     assert standing.radius_m[0] == pytest.approx(np.hypot(30, 15))
@@ -101,8 +102,8 @@ def test_retraction_returns_count_and_appends_once(tmp_path):
     with store.open_for_writing() as log:
         log.append(many)
         assert log.retract([many[0].id, many[1].id], "test") == 2
-        entries = sorted(log.folder.iterdir())
-        assert log.retract([many[0].id], "again") == 0 and sorted(log.folder.iterdir()) == entries
+        entries = store.objects.list("log")
+        assert log.retract([many[0].id], "again") == 0 and store.objects.list("log") == entries
         assert log.retract([many[0].id, many[2].id], "more") == 1
         assert len(log.active_observations()) == 2
 
@@ -122,7 +123,7 @@ def test_other_limits_make_the_index_again_and_rows_outside_are_quarantined(tmp_
         assert len(log.rejected) == len(log.index.list_rejected()) == len(far) == 49
         assert set(log.active_observations().ids) == {o.id for o in many} - {o.id for o in (*far, many[0])}
         rows = np.arange(len(log.active_observations()))
-        assert len(read_active(log.folder, log.active_observations(), rows)) == len(rows)
+        assert len(read_active(log.objects, log.active_observations(), rows)) == len(rows)
         assert log.find(agent=far[0].agent) == (far[0].id,) and log.retract([far[0].id], "far") == 1
     with MapStore(tmp_path).open_for_writing() as log:
         assert log.rejected == () and len(log.index.list_rejected()) == len(far)

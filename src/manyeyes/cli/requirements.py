@@ -18,6 +18,7 @@ EXTRAS = {
     "av2": ("pyarrow", "shapely"),
     "dask": ("dask", "distributed"),
     "ray": ("ray",),
+    "cloud": ("fsspec", "s3fs"),
     "icp": ("small_gicp",),
     "ros": ("rosbags",),
     "train": ("tensorboard", "matplotlib", "PIL"),
@@ -80,6 +81,10 @@ _SHAPELY = Requirement("map", ("shapely",))
 _GEOPACKAGE = Requirement("map", ("pyogrio", "shapely"))
 _PILLOW = Requirement("view", ("PIL",))
 _MATPLOTLIB = Requirement("view", ("matplotlib",))
+_CLOUD = (
+    Requirement("cloud", ("fsspec",)).when("store", "*://*"),
+    Requirement("cloud", EXTRAS["cloud"]).when("store", "s3://*"),
+)
 _EXECUTORS = (
     Requirement("dask", EXTRAS["dask"]).when("executor", "dask"),
     Requirement("ray", EXTRAS["ray"]).when("executor", "ray"),
@@ -124,8 +129,9 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
         _SHAPELY.when("method", "polymerge", "global-map-builder", "heatmap-buffer"),
         _SHAPELY.when("store", "*"),
         *_EXECUTORS,
+        *_CLOUD,
     ),
-    "map retract": (_ARROW, _SHAPELY, *_EXECUTORS),
+    "map retract": (_ARROW, _SHAPELY, *_EXECUTORS, *_CLOUD),
     "map evaluate": (_ARROW, _SHAPELY),
     "map diff": (_ARROW,),
     "map export": (

@@ -169,5 +169,5 @@ def _read_store_ground(folder: Path) -> ObservedGround:
 
     store = MapStore(folder)
     active = store.log.active_observations()
-    observations = read_active(store.log.folder, active, np.arange(len(active.ids)))
+    observations = read_active(store.log.objects, active, np.arange(len(active.ids)))
     return ObservedGround.of_observations(observations, store.frame)

@@ -114,7 +114,13 @@ def to_plain(value: object) -> Any:
 
 def write_json(path: Path, payload: object, config: object, seed: int | None) -> dict[str, Any]:
     """Writes ``{"provenance": …, "result": payload}``, whole or not at all, and returns the provenance."""
+    origin, text = render_json(payload, config, seed)
+    atomic_write_text(path, text)
+    return origin
+
+
+def render_json(payload: object, config: object, seed: int | None) -> tuple[dict[str, Any], str]:
+    """Return the provenance, and the text that :func:`write_json` writes."""
     origin = collect_provenance(config, seed)
     text = json.dumps({"provenance": origin, "result": to_plain(payload)}, indent=2, ensure_ascii=False)
-    atomic_write_text(path, text + "\n")
-    return origin
+    return origin, text + "\n"

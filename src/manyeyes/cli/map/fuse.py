@@ -31,12 +31,15 @@ class Options:
     """Folder for the map, two GeoParquet files; 'map' beside the observations by default."""
     method: str = "manyeyes"
     """A registered method: manyeyes, or a baseline such as union, chamfer-nms, polymerge; an unknown name lists all."""
-    store: OutputFolder | None = None
-    """Instead of a map's folder: a store, made if it is not there, which takes the observations in and publishes a release."""
+    store: str | None = None
+    """Instead of a map's folder: a store, made if it is not there, which takes the observations in and publishes a release. A
+    folder, or a URL such as s3://bucket/city; see docs/guides/map-cluster.md."""
     executor: str = "process"
     """What fuses a store's tiles: inline, process, dask or ray."""
     workers: WorkerCount | None = None
     """How many processes; one a core by default. The map does not depend on it."""
+    address: str | None = None
+    """Of a running cluster, such as tcp://scheduler:8786 (dask) or ray://head:10001 (ray); by default one starts here."""
 
 
 def main(options: Options) -> None:
@@ -47,6 +50,8 @@ def main(options: Options) -> None:
     from manyeyes.maps.registry import MAP_FUSION_METHODS
     from manyeyes.studies.map_folder import load_observations
 
+    if options.out is not None and ":/" in str(options.out):
+        raise ConfigError(f"--out is a folder of this machine; for {options.out} say --store and the URL of a store.")
     config = MAP_FUSION_METHODS.get(options.method).config_class()
     console = Console()
     if options.store is not None:
@@ -101,7 +106,7 @@ def _fuse_into_folder(
     )
 
 
-def _fuse_into_store(options: Options, folder: Path, console: Console) -> None:
+def _fuse_into_store(options: Options, place: str, console: Console) -> None:
     """Takes the observations into a store's log and publishes a release, tile by tile."""
     from manyeyes.maps.elements.observation_file import RejectedRows, find_observation_files, read_observations
     from manyeyes.maps.store.executors import make_executor
@@ -111,9 +116,10 @@ def _fuse_into_store(options: Options, folder: Path, console: Console) -> None:
 
     if options.method != "manyeyes":
         raise ConfigError(f"A store is fused by manyeyes' own method; fuse without --store for {options.method}.")
-    executor, source = make_executor(options.executor, options.workers), find_observation_files(options.observations)
-    store_exists = (folder / "store.json").exists()
-    store = MapStore(folder) if store_exists else MapStore.create(folder, read_observations(source).frame)
+    executor = make_executor(options.executor, options.workers, options.address)
+    check_shared(place, options.executor)
+    source = find_observation_files(options.observations)
+    store = MapStore(place) if MapStore.exists(place) else MapStore.create(place, read_observations(source).frame)
     with store.open_for_writing() as log:
         ingested = log.ingest(source)
     known = len(log.rejected)
@@ -129,13 +135,19 @@ def _fuse_into_store(options: Options, folder: Path, console: Console) -> None:
         "rejected": len(rejected),
         "quarantine": [RejectedRows(*row) for row in log.index.list_rejected()],
     }
-    provenance.write_json(folder / "fuse.json", payload, {"options": options}, None)
+    store.objects.put("fuse.json", provenance.render_json(payload, {"options": options}, None)[1].encode())
     console.print(
-        f"{folder}: release {number} after {ingested.num_added} new observations, {ingested.num_known} known, "
+        f"{place}: release {number} after {ingested.num_added} new observations, {ingested.num_known} known, "
         f"{len(rejected)} rejected",
         highlight=False,
         soft_wrap=True,
     )
+
+
+def check_shared(place: str, executor: str) -> None:
+    """Refuse a store that other processes cannot reach, where they are to fuse it."""
+    if place.startswith("memory://") and executor != "inline":
+        raise ConfigError(f"{place} lies in the memory of one process; say --executor inline, or choose another store.")
 
 
 def publish_release(store: MapStore, executor: Executor, console: Console) -> int:

@@ -7,7 +7,6 @@ The log's files and former releases still hold them: a retraction changes what i
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import tyro
 
@@ -19,8 +18,8 @@ from manyeyes.datatypes import ConfigError
 class Options:
     """Which observations, and why."""
 
-    store: tyro.conf.Positional[Path]
-    """The store's folder, of 'map fuse --store'."""
+    store: tyro.conf.Positional[str]
+    """The store's folder or URL, of 'map fuse --store'."""
     reason: str
     """Why; the log records it."""
     ids: tuple[str, ...] = ()
@@ -35,6 +34,8 @@ class Options:
     """What fuses the tiles: inline, process, dask or ray."""
     workers: WorkerCount | None = None
     """How many processes; one a core by default. The map does not depend on it."""
+    address: str | None = None
+    """Of a running cluster, such as tcp://scheduler:8786 (dask) or ray://head:10001 (ray); by default one starts here."""
 
 
 def main(options: Options) -> None:
@@ -51,7 +52,7 @@ def main(options: Options) -> None:
         raise ConfigError("Name the observations: --ids ID ..., or --agent NAME, --pass-id NAME or both.")
     if not options.reason.strip():
         raise ConfigError("--reason is empty; the log records why observations are retracted.")
-    executor = make_executor(options.executor, options.workers)
+    executor = make_executor(options.executor, options.workers, options.address)
     store, console = MapStore(options.store), Console()
 
     def print_status(text: str) -> None:

@@ -8,7 +8,9 @@ the geometry, relations and sources as lists of ids. Source: GeoParquet specific
 
 from __future__ import annotations
 
+import io
 import json
+from collections.abc import Iterable
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -92,10 +94,31 @@ def write_map(vector_map: VectorMap, lines: Path, crossings: Path, rows: NDArray
 
 def read_map(*paths: Path | str) -> VectorMap:
     """Return the map of files in the lossless form, elements by ascending id; one map may stand in many files."""
-    tables = [read_table(Path(path)) for path in paths]
+    return _join_tables([read_table(Path(path)) for path in paths], [Path(path).name for path in paths])
+
+
+def map_to_bytes(vector_map: VectorMap, rows: NDArray[np.int64] | None = None) -> tuple[bytes, bytes]:
+    """Return the two files of :func:`write_map` as bytes."""
+    files = [io.BytesIO(), io.BytesIO()]
+    for table, file in zip(map_to_tables(vector_map, rows), files):
+        _write_parquet(table, file)
+    return files[0].getvalue(), files[1].getvalue()
+
+
+def bytes_to_map(files: Iterable[tuple[str, bytes]]) -> VectorMap:
+    """Return the map of (name, bytes) of files in the lossless form, elements by ascending id."""
+    tables: list[pa.Table] = []
+    names: list[str] = []
+    for name, data in files:
+        tables.append(_read_checked(io.BytesIO(data), name))
+        names.append(name)
+    return _join_tables(tables, names)
+
+
+def _join_tables(tables: list[pa.Table], file_names: list[str]) -> VectorMap:
     frames = {read_frame(table) for table in tables}
     if len(frames) > 1:
-        names = ", ".join(Path(p).name for p in paths[:4])
+        names = ", ".join(file_names[:4])
         raise MapFileError(
             f"{names}: expected files of one frame; got {len(frames)} origins: move them into one first."
         )
@@ -105,11 +128,16 @@ def read_map(*paths: Path | str) -> VectorMap:
 
 def read_table(path: Path) -> pa.Table:
     """Return one file of the lossless form, checked for version and columns."""
+    return _read_checked(path, str(path))
+
+
+def _read_checked(file: Path | io.BytesIO, path: str) -> pa.Table:
+    """Return the table of a file, which ``path`` names."""
     pyarrow = _pyarrow()
     from pyarrow import parquet
 
     try:
-        table = parquet.read_table(path, memory_map=False)
+        table = parquet.read_table(file, memory_map=False)
     except (pyarrow.ArrowException, OSError) as error:
         reason = " ".join(str(error).split())
         raise MapFileError(f"{path}: expected a Parquet file of a map; {reason}. Restore it from a copy.") from None
@@ -392,7 +420,11 @@ def projjson(frame: MapFrame) -> dict[str, Any]:
 
 
 def _write(table: pa.Table, path: Path) -> None:
+    with atomic_replace(path) as temporary:
+        _write_parquet(table, temporary)
+
+
+def _write_parquet(table: pa.Table, file: Path | io.BytesIO) -> None:
     from pyarrow import parquet
 
-    with atomic_replace(path) as temporary:
-        parquet.write_table(table, temporary, compression="zstd", row_group_size=_ROW_GROUP_SIZE, store_schema=True)
+    parquet.write_table(table, file, compression="zstd", row_group_size=_ROW_GROUP_SIZE, store_schema=True)

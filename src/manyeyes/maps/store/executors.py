@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """One function over many blocks: in this process, over a pool of processes, or on a Dask or Ray cluster.
 
+Blocks are taken from an iterable as workers become free: a few for each worker are under way, whatever their number.
+
 Source: the requirement that a block is a pure function's argument, so that any existing engine runs it and the results do not
 depend on which one did, in which order, or on how many workers.
 """
 
 from __future__ import annotations
 
+import itertools
 import logging
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Protocol, TypeVar
 
 from manyeyes.datatypes import ConfigError, ManyeyesError, MissingExtraError
@@ -33,9 +37,36 @@ class WorkerLostError(ManyeyesError):
 class ExecutorSession(Protocol):
     """An engine that is up: runs a function over blocks and yields (index of the block, result) as they finish."""
 
-    def run(self, fn: Callable[[B], R], blocks: Sequence[B]) -> Iterator[tuple[int, R]]:
+    def run(self, fn: Callable[[B], R], blocks: Iterable[B]) -> Iterator[tuple[int, R]]:
         """Return every block once, in any order; an exception of the function is raised here."""
         ...
+
+
+BLOCKS_PER_WORKER = 3
+"""Blocks under way for each worker: one that runs and two that wait, so that no worker waits for this process."""
+
+
+def _run_bounded(
+    submit: Callable[[B], Hashable],
+    wait_for_some: Callable[[list[Any]], Iterable[tuple[Any, R]]],
+    blocks: Iterable[B],
+    max_in_flight: int,
+) -> Iterator[tuple[int, R]]:
+    """Yield (index, result) of every block once, as they finish, with at most so many under way.
+
+    Args:
+        submit: starts a block and returns its handle. wait_for_some: waits until any of the handles has finished, and returns those
+            that have, with their results.
+    """
+    in_flight: dict[Any, int] = {}
+    waiting = enumerate(blocks)
+    while True:
+        for index, block in itertools.islice(waiting, max_in_flight - len(in_flight)):
+            in_flight[submit(block)] = index
+        if not in_flight:
+            return
+        for handle, result in wait_for_some(list(in_flight)):
+            yield in_flight.pop(handle), result
 
 
 class Executor(Protocol):
@@ -55,7 +86,7 @@ class InlineExecutor:
         """Return this executor, which needs no engine."""
         yield self
 
-    def run(self, fn: Callable[[B], R], blocks: Sequence[B]) -> Iterator[tuple[int, R]]:
+    def run(self, fn: Callable[[B], R], blocks: Iterable[B]) -> Iterator[tuple[int, R]]:
         """Yield every block once, in order."""
         for index, block in enumerate(blocks):
             yield index, fn(block)
@@ -68,11 +99,9 @@ class ProcessExecutor:
     Workers are never forks of this process, whose threads of numba or torch would hang them: they are forked from a clean
     server that has imported this package once, or started afresh where the system has no such server.
     A script that calls this needs the usual ``if __name__ == "__main__":``.
-    At most ``queued_per_worker`` blocks a worker wait in the queue, so that large blocks are not all pickled at once.
     """
 
     workers: int | None = None
-    queued_per_worker: int = 2
 
     @contextmanager
     def open(self) -> Iterator[ExecutorSession]:
@@ -84,7 +113,7 @@ class ProcessExecutor:
         workers = self.workers or _available_cores()
         with ProcessPoolExecutor(workers, mp_context=context) as pool:
             try:
-                yield _ProcessSession(pool, workers * (1 + self.queued_per_worker))
+                yield _ProcessSession(pool, workers * BLOCKS_PER_WORKER)
             except BaseException:
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
@@ -97,23 +126,18 @@ class _ProcessSession:
     pool: ProcessPoolExecutor
     max_in_flight: int
 
-    def run(self, fn: Callable[[B], R], blocks: Sequence[B]) -> Iterator[tuple[int, R]]:
+    def run(self, fn: Callable[[B], R], blocks: Iterable[B]) -> Iterator[tuple[int, R]]:
         """Yield every block once, as they finish."""
-        in_flight: dict[Future[R], int] = {}
-        next_block = 0
-        while next_block < len(blocks) or in_flight:
-            while next_block < len(blocks) and len(in_flight) < self.max_in_flight:
-                in_flight[self.pool.submit(fn, blocks[next_block])] = next_block
-                next_block += 1
-            done, _ = wait(in_flight, return_when=FIRST_COMPLETED)
-            for future in done:
-                try:
-                    result = future.result()
-                except BrokenProcessPool as error:
-                    raise WorkerLostError(
-                        "A worker process ended, probably out of memory; run again with fewer --workers: finished steps are kept."
-                    ) from error
-                yield in_flight.pop(future), result
+        return _run_bounded(partial(self.pool.submit, fn), self._wait, blocks, self.max_in_flight)
+
+    def _wait(self, handles: list[Any]) -> Iterator[tuple[Any, Any]]:
+        for future in wait(handles, return_when=FIRST_COMPLETED).done:
+            try:
+                yield future, future.result()
+            except BrokenProcessPool as error:
+                raise WorkerLostError(
+                    "A worker process ended, probably out of memory; run again with fewer --workers: finished steps are kept."
+                ) from error
 
 
 @dataclass(frozen=True)
@@ -145,15 +169,20 @@ class _DaskSession:
 
     client: Any
 
-    def run(self, fn: Callable[[B], R], blocks: Sequence[B]) -> Iterator[tuple[int, R]]:
+    def run(self, fn: Callable[[B], R], blocks: Iterable[B]) -> Iterator[tuple[int, R]]:
         """Yield every block once, as they finish."""
-        from dask.distributed import as_completed
-
+        workers = max(1, sum(self.client.nthreads().values()))
         # pure=False: a block is run, never looked up by a hash of its arguments.
-        futures = [self.client.submit(fn, block, pure=False) for block in blocks]
-        index_of = {future.key: index for index, future in enumerate(futures)}
-        for future in as_completed(futures):
-            yield index_of[future.key], future.result()
+        submit = partial(self.client.submit, fn, pure=False)
+        return _run_bounded(submit, self._wait, blocks, workers * BLOCKS_PER_WORKER)
+
+    @staticmethod
+    def _wait(handles: list[Any]) -> Iterator[tuple[Any, Any]]:
+        from dask.distributed import wait as wait_for
+
+        finished: Any = wait_for(handles, return_when="FIRST_COMPLETED")
+        for future in finished.done:
+            yield future, future.result()
 
 
 @dataclass(frozen=True)
@@ -194,15 +223,15 @@ class _RaySession:
 
     ray: Any
 
-    def run(self, fn: Callable[[B], R], blocks: Sequence[B]) -> Iterator[tuple[int, R]]:
+    def run(self, fn: Callable[[B], R], blocks: Iterable[B]) -> Iterator[tuple[int, R]]:
         """Yield every block once, as they finish."""
-        remote = self.ray.remote(fn)
-        index_of = {remote.remote(block): index for index, block in enumerate(blocks)}
-        waiting = list(index_of)
-        while waiting:
-            done, waiting = self.ray.wait(waiting, num_returns=1)
-            for reference in done:
-                yield index_of[reference], self.ray.get(reference)
+        workers = max(1, int(self.ray.cluster_resources().get("CPU", 1)))
+        return _run_bounded(self.ray.remote(fn).remote, self._wait, blocks, workers * BLOCKS_PER_WORKER)
+
+    def _wait(self, handles: list[Any]) -> Iterator[tuple[Any, Any]]:
+        done, _ = self.ray.wait(handles, num_returns=1)
+        for reference in done:
+            yield reference, self.ray.get(reference)
 
 
 EXECUTORS: tuple[str, ...] = ("inline", "process", "dask", "ray")
@@ -210,6 +239,10 @@ EXECUTORS: tuple[str, ...] = ("inline", "process", "dask", "ray")
 
 def make_executor(name: str, workers: int | None = None, address: str | None = None) -> Executor:
     """Return the executor of a name from the command line: one of ``EXECUTORS``."""
+    if address is not None and name in ("inline", "process"):
+        raise ConfigError(
+            f"The executor '{name}' runs on this machine and has no address; choose dask or ray for {address}."
+        )
     if name == "inline":
         return InlineExecutor()
     if name == "process":

@@ -1,18 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """SQLite index of an observation log (write-ahead log): file position and map position of each observation.
 
-The files of the log are authoritative; the index contains nothing that cannot be rebuilt from them.
+The files of the log are authoritative; the index contains nothing that cannot be rebuilt from them. Observations are found by
+cells of 256 m, so that a program that walks over a city holds the rows of one place at a time.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import sqlite3
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +23,17 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_VERSION = 3
+_VERSION = 4
+CELL_M = 256.0
+"""Side of the cells by which observations are found."""
+_COUNTS = "id NOT IN (SELECT id FROM retracted) AND id NOT IN (SELECT id FROM failed)"
+_COLUMNS = "id, segment, row_group, time_ns, x, y, reach_m"
 _SCHEMA = {
     "entries": "(name TEXT PRIMARY KEY, rows INTEGER NOT NULL) WITHOUT ROWID",
     "observations": """(
         id BLOB PRIMARY KEY, segment TEXT NOT NULL, row_group INTEGER NOT NULL, time_ns INTEGER NOT NULL,
-        agent TEXT NOT NULL, x REAL NOT NULL, y REAL NOT NULL, reach_m REAL NOT NULL, pass_id TEXT NOT NULL
+        agent TEXT NOT NULL, x REAL NOT NULL, y REAL NOT NULL, reach_m REAL NOT NULL, pass_id TEXT NOT NULL,
+        cell_x INTEGER NOT NULL, cell_y INTEGER NOT NULL
     ) WITHOUT ROWID""",
     # Rows of segments that are outside the limits; each is in the quarantine too, with its reason.
     "refused": "(id BLOB PRIMARY KEY, agent TEXT NOT NULL, pass_id TEXT NOT NULL) WITHOUT ROWID",
@@ -169,11 +177,23 @@ class LogIndex:
     def add_segment(self, name: str, rows: Iterable[IndexRow], invalid: Iterable[InvalidEntry] = ()) -> None:
         """Index a segment of observations, and its rows that are none; one in two segments keeps its first place."""
         values = [
-            (bytes.fromhex(r.id), name, r.row_group, r.time_ns, r.agent, r.x, r.y, r.radius_m, r.pass_id) for r in rows
+            (
+                bytes.fromhex(r.id),
+                name,
+                r.row_group,
+                r.time_ns,
+                r.agent,
+                r.x,
+                r.y,
+                r.radius_m,
+                r.pass_id,
+                *_cell(r.x, r.y),
+            )
+            for r in rows
         ]
         outside = list(invalid)
         with self._open() as db:
-            db.executemany("INSERT OR IGNORE INTO observations VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", values)
+            db.executemany("INSERT OR IGNORE INTO observations VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", values)
             db.executemany(
                 "INSERT OR IGNORE INTO refused VALUES (?, ?, ?)",
                 [(bytes.fromhex(r.id), r.agent, r.pass_id) for r in outside],
@@ -208,23 +228,57 @@ class LogIndex:
     def active_observations(self) -> ActiveObservations:
         """Return all observations that count."""
         with self._open() as db:
-            rows = db.execute(
-                "SELECT id, segment, row_group, time_ns, x, y, reach_m FROM observations "
-                "WHERE id NOT IN (SELECT id FROM retracted) AND id NOT IN (SELECT id FROM failed) ORDER BY id"
-            ).fetchall()
-        segments = tuple(sorted({row[1] for row in rows}))
-        number = {name: k for k, name in enumerate(segments)}
-        return ActiveObservations(
-            ids=tuple(row[0].hex() for row in rows),
-            segments=segments,
-            segment=np.array([number[row[1]] for row in rows], np.int64),
-            row_group=np.array([row[2] for row in rows], np.int64),
-            time_ns=np.array([row[3] for row in rows], np.int64),
-            xy=np.array([row[4:6] for row in rows], np.float64).reshape(-1, 2),
-            radius_m=np.array([row[6] for row in rows], np.float64),
-        )
+            return _to_active(db.execute(f"SELECT {_COLUMNS} FROM observations WHERE {_COUNTS} ORDER BY id").fetchall())
+
+    def active_within(self, area: tuple[float, float, float, float]) -> ActiveObservations:
+        """Return the observations that count and stand in an area (x0, y0, x1, y1; metres), and some around it."""
+        (low_x, low_y), (high_x, high_y) = _cell(area[0], area[1]), _cell(area[2], area[3])
+        query = f"SELECT {_COLUMNS} FROM observations WHERE cell_x = ? AND cell_y BETWEEN ? AND ? AND {_COUNTS}"
+        with self._open() as db:
+            rows = [row for x in range(low_x, high_x + 1) for row in db.execute(query, (x, low_y, high_y))]
+        return _to_active(sorted(rows, key=lambda row: row[0]))
+
+    def active_with_ids(self, ids: Iterable[str]) -> ActiveObservations:
+        """Return those of these observations that count."""
+        query = f"SELECT {_COLUMNS} FROM observations WHERE id = ? AND {_COUNTS}"
+        with self._open() as db:
+            rows = [row for name in sorted(set(ids)) for row in db.execute(query, (bytes.fromhex(name),))]
+        return _to_active(rows)
+
+    def active_cells(self) -> tuple[list[tuple[int, int]], float]:
+        """Return the cells where observations stand that count, ascending, and the largest radius of one (m)."""
+        query = f"SELECT cell_x, cell_y, max(reach_m) FROM observations WHERE {_COUNTS} GROUP BY cell_x, cell_y ORDER BY 1, 2"
+        with self._open() as db:
+            rows = db.execute(query).fetchall()
+        return [(x, y) for x, y, _ in rows], max((radius for *_, radius in rows), default=0.0)
+
+    def iterate_active(self) -> Iterator[tuple[str, int]]:
+        """Iterate over id and time (ns) of all observations that count, ids ascending."""
+        with self._open() as db:
+            for name, time_ns in db.execute(f"SELECT id, time_ns FROM observations WHERE {_COUNTS} ORDER BY id"):
+                yield name.hex(), time_ns
+
+
+def _cell(x: float, y: float) -> tuple[int, int]:
+    return math.floor(x / CELL_M), math.floor(y / CELL_M)
+
+
+def _to_active(rows: list[tuple[Any, ...]]) -> ActiveObservations:
+    """Return rows of _COLUMNS, ids ascending, as columns."""
+    segments = tuple(sorted({row[1] for row in rows}))
+    number = {name: k for k, name in enumerate(segments)}
+    return ActiveObservations(
+        ids=tuple(row[0].hex() for row in rows),
+        segments=segments,
+        segment=np.array([number[row[1]] for row in rows], np.int64),
+        row_group=np.array([row[2] for row in rows], np.int64),
+        time_ns=np.array([row[3] for row in rows], np.int64),
+        xy=np.array([row[4:6] for row in rows], np.float64).reshape(-1, 2),
+        radius_m=np.array([row[6] for row in rows], np.float64),
+    )
 
 
 def _create_tables(db: sqlite3.Connection) -> None:
     for name, columns in _SCHEMA.items():
         db.execute(f"CREATE TABLE IF NOT EXISTS {name} {columns}")
+    db.execute("CREATE INDEX IF NOT EXISTS by_cell ON observations (cell_x, cell_y)")

@@ -10,23 +10,23 @@ from __future__ import annotations
 import json
 from collections import Counter
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._io import atomic_write
 from manyeyes._jit import F64x2, njit
 from manyeyes.datatypes import MissingExtraError
 from manyeyes.maps.elements.vector_map import VectorMap, compute_element_digests
 from manyeyes.maps.formats.attributes import to_hex_ids
-from manyeyes.maps.formats.geoparquet import MapFileError, read_map, write_map
+from manyeyes.maps.formats.geoparquet import MapFileError, bytes_to_map, map_to_bytes
+from manyeyes.maps.store.object_store import ObjectStore
 from manyeyes.maps.store.observation_log import tile_indices
 
 Ints = NDArray[np.int64]
 
 _MATCH_RADIUS_M = 1.0
 _MIN_FRACTION = 0.5
+_FILES = ("lines.parquet", "crossings.parquet")
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,29 +97,31 @@ def apply_delta(before: VectorMap, delta: MapDelta) -> VectorMap:
     return after.take(np.lexsort(after.id.T[::-1]))
 
 
-def write_delta(delta: MapDelta, folder: Path) -> None:
+def write_delta(delta: MapDelta, objects: ObjectStore, folder: str) -> None:
     """Write a delta: ``lines.parquet`` and ``crossings.parquet`` of what changed, then ``delta.json`` with the rest."""
-    write_map(delta.changed, folder / "lines.parquet", folder / "crossings.parquet")
+    for name, data in zip(_FILES, map_to_bytes(delta.changed)):
+        objects.put(f"{folder}/{name}", data)
     tiles = [
         {"x": x, "y": y, "added": added, "modified": modified, "deleted": deleted}
         for (x, y), added, modified, deleted in delta.by_tile()
     ]
     gone = [{"id": name, "tile": tile} for name, tile in zip(delta.deleted, delta.deleted_tiles.tolist(), strict=True)]
     text = json.dumps({"version": 1, "added": list(delta.added), "deleted": gone, "tiles": tiles}, indent=1)
-    atomic_write(folder / "delta.json", text.encode())
+    objects.put(f"{folder}/delta.json", text.encode())
 
 
-def read_delta(folder: Path) -> MapDelta:
+def read_delta(objects: ObjectStore, folder: str) -> MapDelta:
     """Return a delta that :func:`write_delta` wrote."""
+    place = f"{objects.location}/{folder}"
     try:
-        content = json.loads((folder / "delta.json").read_bytes())
+        content = json.loads(objects.get(f"{folder}/delta.json"))
         gone = content["deleted"]
         tiles = np.array([one["tile"] for one in gone], np.int64).reshape(-1, 2)
         added, deleted = tuple(content["added"]), tuple(one["id"] for one in gone)
     except (OSError, ValueError, KeyError, TypeError) as error:
         reason = " ".join(str(error).split())
-        raise MapFileError(f"{folder}: expected the delta of a map; {type(error).__name__} {reason}.") from None
-    changed = read_map(folder / "lines.parquet", folder / "crossings.parquet")
+        raise MapFileError(f"{place}: expected the delta of a map; {type(error).__name__} {reason}.") from None
+    changed = bytes_to_map((f"{place}/{name}", objects.get(f"{folder}/{name}")) for name in _FILES)
     return MapDelta(changed, added, deleted, tiles)
 
 

@@ -1,21 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """An append-only log of observations: Parquet segments that are never changed, and an index beside them.
 
-An entry is one file: a segment of observations (docs/reference/map-observations.md), a retraction, or what an ingest rejected;
-its name is its number and a hash of its content. An entry is written under another name, flushed and renamed, then indexed: a
-writer that is killed leaves the log without the entry or with it, and one that is there but not indexed is indexed when the log
-is opened to be written.
+An entry is one object: a segment of observations (docs/reference/map-observations.md), a retraction, or what an ingest rejected;
+its name is its number and a hash of its content. An entry is written whole, then indexed: a writer that is killed leaves the log
+without the entry or with it, and one that is there but not indexed is indexed when the log is opened to be written.
 """
 
 from __future__ import annotations
 
 import difflib
-import fcntl
 import hashlib
+import io
 import json
-import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,8 +21,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._io import atomic_replace, atomic_write, remove_unfinished
-from manyeyes.datatypes import ManyeyesError
 from manyeyes.datatypes.extras import import_extra
 from manyeyes.maps.elements.observation import MapFrame, Observation, shorten
 from manyeyes.maps.elements.observation_file import (
@@ -37,18 +32,16 @@ from manyeyes.maps.elements.observation_file import (
 )
 from manyeyes.maps.elements.observation_limits import LIMITS
 from manyeyes.maps.isolation import FailedObservation, reject_failed
-from manyeyes.maps.store.log_index import ActiveObservations, IndexRow, InvalidEntry, LogIndex
+from manyeyes.maps.store.log_index import CELL_M, ActiveObservations, IndexRow, InvalidEntry, LogIndex
+from manyeyes.maps.store.object_store import ObjectStore, StoreError
 
 _parquet = partial(import_extra, "pyarrow.parquet", "map", "A log of observations")
 
-TILE_M = 256.0
+TILE_M = CELL_M
+LOG = "log"
 # Observations of a tile stand together, so that reading a tile decodes little else.
 _ROW_GROUP_SIZE = 128
 _ID_DIGITS = 32
-
-
-class StoreError(ManyeyesError):
-    """A store that is damaged, locked, or of another frame or version; the text names the file and the remedy."""
 
 
 @dataclass(frozen=True)
@@ -61,27 +54,33 @@ class IngestResult:
 
 
 class ObservationLog:
-    """The log in a folder; frame: of all its poses.
+    """The log in a store; frame: of all its poses.
+
+    index_is_cache: the index may be of another time: one that names more than the log has is made again.
 
     rejected: observations of segments that were found to be outside the limits, or with which a fusion failed, since this object
         was made; the index lists all.
     """
 
-    def __init__(self, folder: Path, frame: MapFrame) -> None:
-        self.folder, self.frame = folder, frame
-        self.index = LogIndex(folder.parent / "catalogue.sqlite")
+    def __init__(self, objects: ObjectStore, frame: MapFrame, index: Path, index_is_cache: bool = False) -> None:
+        self.objects, self.frame, self.index_is_cache = objects, frame, index_is_cache
+        self.index = LogIndex(index)
+        self.place = f"{objects.location}/{LOG}"
         self.rejected: tuple[RejectedRows, ...] = ()
 
     def recover(self) -> None:
         """Index entries that a killed writer left without, or all under new limits; the caller holds the lock."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        remove_unfinished(self.folder)
-        if not self.index.is_current(repr(LIMITS)):
+        names = self._names()
+        stale = self.index_is_cache and not self.index.entries() <= set(names)
+        if stale or not self.index.is_current(repr(LIMITS)):
             self.index.clear(repr(LIMITS))
         indexed = self.index.entries()
-        for path in sorted(self.folder.iterdir()):
-            if path.name not in indexed:
-                self._index(path)
+        for name in names:
+            if name not in indexed:
+                self._index(name)
+
+    def _names(self) -> list[str]:
+        return [key.removeprefix(f"{LOG}/") for key in self.objects.list(LOG)]
 
     def ingest(self, source: Path | str) -> IngestResult:
         """Read a file or folder of observations, append the new ones, and keep a record of what was rejected."""
@@ -93,12 +92,12 @@ class ObservationLog:
 
     def quarantine(self, failures: Sequence[FailedObservation]) -> tuple[RejectedRows, ...]:
         """Append that the fusion fails with these observations, which count no more; returns a record of each."""
-        active = self.active_observations()
-        rows = np.array([active.ids.index(one.id) for one in failures], np.int64)
-        stored = {o.id: o for o in read_active(self.folder, active, rows)}
+        active = self.index.active_with_ids(one.id for one in failures)
+        stored = {o.id: o for o in read_active(self.objects, active, np.arange(len(active)))}
+        rows = [active.ids.index(one.id) for one in failures]
         rejected = tuple(
-            reject_failed(str(self.folder / active.segments[active.segment[row]]), stored[one.id], one.reason)
-            for row, one in zip(rows.tolist(), failures)
+            reject_failed(f"{self.place}/{active.segments[active.segment[row]]}", stored[one.id], one.reason)
+            for row, one in zip(rows, failures)
         )
         self._append_quarantine(rejected, [one.id for one in failures])
         self.rejected += rejected
@@ -107,9 +106,7 @@ class ObservationLog:
     def _append_quarantine(self, rejected: Sequence[RejectedRows], failed_ids: Sequence[str] = ()) -> None:
         rows = [[q.file, q.row, q.count, q.reason] for q in rejected]
         text = json.dumps({"quarantined": rows, "failed": list(failed_ids)}, indent=1).encode()
-        path = self.folder / self._name(hashlib.blake2b(text, digest_size=8).hexdigest(), "quarantine.json")
-        atomic_write(path, text)
-        self._index(path)
+        self._add(text, "quarantine.json")
 
     def append(self, observations: Sequence[Observation]) -> tuple[int, int]:
         """Append those that are not there yet as one segment: (added, known)."""
@@ -119,9 +116,9 @@ class ObservationLog:
         if new:
             new = _sort_by_tile(new)
             digest = hashlib.blake2b("".join(o.id for o in new).encode(), digest_size=8).hexdigest()
-            path = self.folder / self._name(digest, "parquet")
-            self._write_segment(new, path)
-            self.index.add_segment(path.name, [_to_index_row(o, k // _ROW_GROUP_SIZE) for k, o in enumerate(new)])
+            name = self._name(digest, "parquet")
+            self.objects.put(f"{LOG}/{name}", self._segment_bytes(new))
+            self.index.add_segment(name, [_to_index_row(o, k // _ROW_GROUP_SIZE) for k, o in enumerate(new)])
         return len(new), len(observations) - len(new)
 
     def find(self, ids: Sequence[str] = (), agent: str | None = None, pass_id: str | None = None) -> tuple[str, ...]:
@@ -137,7 +134,7 @@ class ObservationLog:
         if agent is not None or pass_id is not None:
             sent = self.index.ids_of_sender(agent, pass_id)
             if not sent:
-                raise StoreError(f"{self.folder}: no observation of {self._describe_unknown(agent, pass_id)}")
+                raise StoreError(f"{self.place}: no observation of {self._describe_unknown(agent, pass_id)}")
             found.update(sent)
         return tuple(sorted(found))
 
@@ -149,7 +146,7 @@ class ObservationLog:
         if len(found) != 1:
             count = f"{len(found)} observations have" if found else "no observation has"
             remedy = "give more digits." if found else "ids are those that a map or a quarantine names."
-            raise StoreError(f"{self.folder}: {count} an id that starts with {digits}; {remedy}")
+            raise StoreError(f"{self.place}: {count} an id that starts with {digits}; {remedy}")
         return found
 
     def _describe_unknown(self, agent: str | None, pass_id: str | None) -> str:
@@ -170,102 +167,101 @@ class ObservationLog:
         missing = sorted(set(ids) - self.index.filter_known(ids))
         if missing:
             raise StoreError(
-                f"{self.folder}: no observation {missing[0]} to retract; {len(missing)} of {len(ids)} are unknown."
+                f"{self.place}: no observation {missing[0]} to retract; {len(missing)} of {len(ids)} are unknown."
             )
         fresh = sorted(set(ids) - self.index.filter_retracted(ids))
         if fresh:
             text = json.dumps({"retracted": fresh, "reason": reason}, indent=1).encode()
-            path = self.folder / self._name(hashlib.blake2b(text, digest_size=8).hexdigest(), "retract.json")
-            atomic_write(path, text)
-            self._index(path)
+            self._add(text, "retract.json")
         return len(fresh)
 
     def active_observations(self) -> ActiveObservations:
         """Where every observation that counts stands."""
         return self.index.active_observations()
 
-    def _write_segment(self, observations: Sequence[Observation], path: Path) -> None:
-        parquet = _parquet()
+    def _segment_bytes(self, observations: Sequence[Observation]) -> bytes:
+        parquet, file = _parquet(), io.BytesIO()
         table = observation_table(observations, self.frame)
-        with atomic_replace(path) as temporary:
-            parquet.write_table(
-                table, temporary, compression="zstd", row_group_size=_ROW_GROUP_SIZE, write_page_checksum=True
-            )
+        parquet.write_table(table, file, compression="zstd", row_group_size=_ROW_GROUP_SIZE, write_page_checksum=True)
+        return file.getvalue()
 
     def _name(self, digest: str, kind: str) -> str:
-        numbers = [int(path.name.split("-")[0]) for path in self.folder.iterdir() if path.name[0] != "."]
+        numbers = [int(name.split("-")[0]) for name in self._names()]
         return f"{max(numbers, default=0) + 1:08d}-{digest}.{kind}"
 
-    def _index(self, path: Path) -> None:
-        if path.name.endswith(".parquet"):
-            self._index_segment(path)
-            return
-        content = json.loads(path.read_bytes())
-        if path.name.endswith(".retract.json"):
-            self.index.add_retraction(path.name, content["retracted"], content["reason"])
-        elif path.name.endswith(".quarantine.json"):
-            rows = [tuple(row) for row in content["quarantined"]]
-            self.index.add_rejected(path.name, rows, content.get("failed", ()))
-        else:
-            raise StoreError(f"{path}: no entry of a log of observations; move the file elsewhere.")
+    def _add(self, text: bytes, kind: str) -> None:
+        """Append an entry of text and index it."""
+        name = self._name(hashlib.blake2b(text, digest_size=8).hexdigest(), kind)
+        self.objects.put(f"{LOG}/{name}", text)
+        self._index(name)
 
-    def _index_segment(self, path: Path) -> None:
+    def _index(self, name: str) -> None:
+        if name.endswith(".parquet"):
+            self._index_segment(name)
+            return
+        if name.endswith(".retract.json"):
+            content = json.loads(self.objects.get(f"{LOG}/{name}"))
+            self.index.add_retraction(name, content["retracted"], content["reason"])
+        elif name.endswith(".quarantine.json"):
+            content = json.loads(self.objects.get(f"{LOG}/{name}"))
+            rows = [tuple(row) for row in content["quarantined"]]
+            self.index.add_rejected(name, rows, content.get("failed", ()))
+        else:
+            raise StoreError(f"{self.place}/{name}: no entry of a log of observations; move the file elsewhere.")
+
+    def _index_segment(self, name: str) -> None:
         """Index the observations of a segment; rows outside the limits are rejected."""
         rows: list[IndexRow] = []
         invalid: list[InvalidEntry] = []
-        for group in range(_groups(path)):
-            for item in _read_rows(path, [group]):
+        for group in range(_count_groups(self.objects, name)):
+            for item in _read_rows(self.objects, name, [group]):
                 if isinstance(item, Observation):
                     rows.append(_to_index_row(item, group))
                 else:
                     number = len(rows) + len(invalid)
                     reason = f"{item.reason} Its id is {item.id}."
                     invalid.append(InvalidEntry(item.id, item.agent, item.pass_id, number, reason))
-        self.index.add_segment(path.name, rows, invalid)
-        self.rejected += tuple(RejectedRows(str(path), r.row, 1, r.reason) for r in invalid)
+        self.index.add_segment(name, rows, invalid)
+        self.rejected += tuple(RejectedRows(f"{self.place}/{name}", r.row, 1, r.reason) for r in invalid)
 
 
-def read_groups(segment: Path, groups: Sequence[int]) -> list[Observation]:
-    """Return the observations of some row groups of a segment, in their order; rows outside the limits are left out."""
-    return [item for item in _read_rows(segment, groups) if isinstance(item, Observation)]
-
-
-def _read_rows(segment: Path, groups: Sequence[int]) -> list[Observation | InvalidRow]:
+def _read_rows(objects: ObjectStore, segment: str, groups: Sequence[int]) -> list[Observation | InvalidRow]:
     """Read the rows of some row groups; one that is no observation has an id that agrees with its content.
 
     Such a row is what an older version, with wider limits, wrote. Any other wrong row is damage, hence a StoreError.
     """
-    parquet = _parquet()
+    parquet, place = _parquet(), f"{objects.location}/{LOG}/{segment}"
     from pyarrow import ArrowException
 
     try:
-        opened = parquet.ParquetFile(segment, page_checksum_verification=True)
-        table = opened.read_row_groups(list(groups))
+        with objects.open(f"{LOG}/{segment}") as file:
+            table = parquet.ParquetFile(file, page_checksum_verification=True).read_row_groups(list(groups))
     except (ArrowException, OSError) as error:
         reason = " ".join(str(error).split())
-        raise StoreError(f"{segment}: expected a whole segment of the log; {reason}. Restore it from a copy.") from None
+        raise StoreError(f"{place}: expected a whole segment of the log; {reason}. Restore it from a copy.") from None
     out = list(iterate_rows(table))
     for row, item in enumerate(out):
         if isinstance(item, InvalidRow) and not item.id:
             raise StoreError(
-                f"{segment}: row {row} of groups {list(groups)[:3]}: {item.reason} Restore the file from a copy."
+                f"{place}: row {row} of groups {list(groups)[:3]}: {item.reason} Restore the file from a copy."
             )
     return out
 
 
-def read_active(folder: Path, active: ActiveObservations, row_indices: NDArray[np.int64]) -> list[Observation]:
+def read_active(objects: ObjectStore, active: ActiveObservations, row_indices: NDArray[np.int64]) -> list[Observation]:
     """Return the observations in these rows of the index, ids ascending."""
     wanted_ids = {active.ids[row] for row in row_indices.tolist()}
     out: dict[str, Observation] = {}
     for number in np.unique(active.segment[row_indices]).tolist():
         groups = np.unique(active.row_group[row_indices[active.segment[row_indices] == number]]).tolist()
-        for o in read_groups(folder / active.segments[number], groups):
-            if o.id in wanted_ids:
+        for o in _read_rows(objects, active.segments[number], groups):
+            # Rows outside the limits are left out.
+            if isinstance(o, Observation) and o.id in wanted_ids:
                 out[o.id] = o
     missing = wanted_ids - set(out)
     if missing:
         raise StoreError(
-            f"{folder}: observation {min(missing)} is indexed but not there; restore its segment from a copy."
+            f"{objects.location}/{LOG}: observation {min(missing)} is indexed but not there; restore its segment from a copy."
         )
     return [out[name] for name in sorted(out)]
 
@@ -273,23 +269,6 @@ def read_active(folder: Path, active: ActiveObservations, row_indices: NDArray[n
 def tile_indices(xy: NDArray[np.float64], tile_size_m: float = TILE_M) -> NDArray[np.int64]:
     """Return (N, 2) column and row of the tile that each point (N, 2) lies in; tiles are half open and anchored at the origin."""
     return np.floor(np.asarray(xy, np.float64).reshape(-1, 2) / tile_size_m).astype(np.int64)
-
-
-@contextmanager
-def hold_lock(path: Path) -> Iterator[None]:
-    """Hold a store's lock, which the system takes back from a program that is killed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise StoreError(
-                f"{path.parent}: another program is writing to this store; try again when it has ended."
-            ) from None
-        yield
-    finally:
-        os.close(handle)
 
 
 def _sort_by_tile(observations: Sequence[Observation]) -> list[Observation]:
@@ -310,12 +289,14 @@ def compute_radius(o: Observation) -> float:
     return float(np.hypot(points[:, 0], points[:, 1]).max())
 
 
-def _groups(path: Path) -> int:
+def _count_groups(objects: ObjectStore, segment: str) -> int:
     parquet = _parquet()
     from pyarrow import ArrowException
 
     try:
-        return parquet.ParquetFile(path).num_row_groups
+        with objects.open(f"{LOG}/{segment}") as file:
+            return parquet.ParquetFile(file).num_row_groups
     except (ArrowException, OSError) as error:
         reason = " ".join(str(error).split())
-        raise StoreError(f"{path}: expected a whole segment of the log; {reason}. Restore it from a copy.") from None
+        place = f"{objects.location}/{LOG}/{segment}"
+        raise StoreError(f"{place}: expected a whole segment of the log; {reason}. Restore it from a copy.") from None

@@ -1,46 +1,63 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tiled fusion of large areas, with the same result as fusion in one piece.
 
-Phase A solves the pose of each observation in the block of tiles that contains it (its home), given all observations that its
-lines can meet: a coarse search, then sweeps, each of which starts from the poses of all blocks after the previous one. Phase B
-builds the stations of each block from all observations that reach into it. Then one process links the stations of all blocks,
-which are few, so that no line is cut at a border. Every step is a pure function of a block's inputs. Its result is stored under
-a hash of them, so that a run after an interruption, or with a few more observations, computes only what is new.
+The ground is divided into blocks of tiles. A block aligns its home observations, given all that their lines can meet: a coarse
+search, then sums of pairs, of which the poses are solved domain by domain (:mod:`manyeyes.maps.fusion.pose_optimization`). Last it
+builds the stations of its area from all observations that reach into it. One worker links the stations of all blocks, which are
+few, so that no line is cut at a border.
+
+Every step is a pure function of objects in a store: a worker reads them, and writes its result to the store under a name that holds
+a hash of what it was made from and one of its content. So poses pass between neighbours alone, and this process holds the names
+of objects: about a kilobyte a block. A run after an interruption, or with a few more observations, computes only what is new. The
+result of a step takes the place of the former one.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import partial
-from pathlib import Path
-from typing import TypeVar
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from itertools import count, product
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._records import load_record, save_record
+from manyeyes._records import pack_record, unpack_record
 from manyeyes._source import source_digest
 from manyeyes.datatypes import ConfigError
 from manyeyes.maps.elements.observation import MapFrame
 from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.maps.fusion.agent_weights import AgentSums, AgentTable, apply_agents
 from manyeyes.maps.fusion.fuse import MapFusionConfig, assemble_map
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays, to_observation_arrays
-from manyeyes.maps.fusion.pose_optimization import merge_solutions, run_step, search_coarse_poses
-from manyeyes.maps.fusion.pose_solution import PoseSolution
+from manyeyes.maps.fusion.pose_optimization import (
+    find_domain_area,
+    list_domains,
+    run_step,
+    search_coarse_poses,
+    solve_domain,
+    weigh_agents,
+)
+from manyeyes.maps.fusion.pose_solution import PoseSolution, make_initial_solution
 from manyeyes.maps.fusion.stations import Area, StationTable, build_stations
 from manyeyes.maps.isolation import CONTENT_ERRORS, FailedObservation, FailedObservationsError, isolate_failures
-from manyeyes.maps.store.executors import Executor, ExecutorSession, ProcessExecutor, map_blocks
-from manyeyes.maps.store.log_index import ActiveObservations
-from manyeyes.maps.store.observation_log import TILE_M, StoreError, read_active, tile_indices
+from manyeyes.maps.store.executors import ExecutorSession
+from manyeyes.maps.store.log_index import ActiveObservations, LogIndex
+from manyeyes.maps.store.object_store import ObjectNotFoundError, ObjectStore, StoreError
+from manyeyes.maps.store.observation_log import TILE_M, read_active, tile_indices
 
 T = TypeVar("T")
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
+Place = tuple[int, int]
 
 #: What releases name as their origin.
 ALGORITHM = "manyeyes.fuse/1"
+WORK = "work"
+_FAN_IN = 64
+"""Parts whose sums one worker adds; sums of more are added level by level."""
 
 #: Called as steps go on: (name of the step, blocks done, blocks in all).
 StepProgress = Callable[[str, int, int], None]
@@ -66,226 +83,408 @@ class TiledFusionConfig:
         if not (self.tile_size_m > 0 and self.tiles_per_block >= 1 and self.margin_m >= 0 and self.halo_m >= 0):
             raise ConfigError(f"TiledFusionConfig needs positive sizes and at least one tile a block; got {self}.")
 
+    @property
+    def block_m(self) -> float:
+        """The side of a block."""
+        return self.tile_size_m * self.tiles_per_block
+
 
 @dataclass(frozen=True, eq=False)
 class TileBlock:
-    """One unit of work: the observations that it reads, the home observations among them, and its area.
+    """One unit of work.
 
-    log_folder: folder of segments. observations: rows of the index that it reads, ids ascending.
-    home_ids: ids of the home observations. area: (x0, y0, x1, y1) metres. work_folder: folder for results of steps.
+    place: column and row. area: (x0, y0, x1, y1) metres. observations: the rows of the index that it reads, ids ascending.
+    home_ids: ids of the home observations among them.
     """
 
-    log_folder: Path
+    place: Place
+    area: Area
     observations: ActiveObservations
     home_ids: tuple[str, ...]
-    area: Area
-    work_folder: Path
+
+
+@dataclass(frozen=True)
+class FusionJob:
+    """What all steps of one fusion share: where the log is, where results go, and the configuration; pickles."""
+
+    log: ObjectStore
+    work: ObjectStore
     config: MapFusionConfig
 
+
+@dataclass(frozen=True)
+class _Plan:
+    """What this process knows of a block: the key of its TileBlock, whether it is home to observations, and the blocks and domains
+    that those it reads are at home in; home_domains: of its own.
+    """
+
+    place: Place
+    members: str
+    blocks: tuple[Place, ...]
+    domains: tuple[Place, ...]
+    home_domains: tuple[Place, ...]
+
+
+@dataclass(frozen=True)
+class StepTask:
+    """One step of one place, a pure function of the objects under ``inputs`` and ``agents`` (a table of agents; "": none yet)."""
+
+    job: FusionJob
+    kind: str
+    place: Place
+    number: int
+    inputs: tuple[str, ...]
+    agents: str = ""
+
     @property
-    def key(self) -> str:
-        """Hash of the block's observations, home, area and configuration, and of the code of the steps."""
-        code = f"{ALGORITHM} {source_digest(__name__)}"
-        text = "|".join(
-            (code, repr(self.config), repr(self.area), ",".join(self.home_ids), ",".join(self.observations.ids))
-        )
+    def folder(self) -> str:
+        """The folder of the result."""
+        return f"{WORK}/{self.kind}-{self.number}/{self.place[0]}_{self.place[1]}"
+
+    @property
+    def digest(self) -> str:
+        """Hash of the content of the inputs, of the configuration, and of the code."""
+        contents = [_content_digest(key) for key in (*self.inputs, self.agents)]
+        text = "|".join((_code(), repr(self.job.config), self.kind, str(self.number), str(self.place), *contents))
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
-@dataclass(frozen=True, eq=False)
-class _BlockStep:
-    """A block with the solution of the previous step; number -1 is the coarse search, then sweeps; None: stations."""
+@dataclass(frozen=True)
+class StepResult:
+    """The keys of a step's results, or the observations with which it fails."""
 
-    block: TileBlock
-    solution: PoseSolution | None
-    number: int | None
+    keys: tuple[str, ...]
+    failures: tuple[FailedObservation, ...] = ()
 
-    @property
-    def path(self) -> Path:
-        """The path of the result."""
-        digest = hashlib.blake2b(self.block.key.encode(), digest_size=16)
-        digest.update(str(self.number).encode())
-        if self.solution is not None:
-            digest.update(",".join(self.solution.ids).encode())
-            for f in fields(PoseSolution):
-                value = getattr(self.solution, f.name)
-                if isinstance(value, np.ndarray):
-                    digest.update((value + 0.0).tobytes())
-        return self.block.work_folder / f"{digest.hexdigest()}.record"
+
+class LostResultError(StoreError):
+    """A result that a step has left is missing or damaged; key: its own."""
+
+    def __init__(self, key: str) -> None:
+        super().__init__(key)
+        self.key = key
 
 
 def fuse_tiles(
-    log_folder: Path,
-    active: ActiveObservations,
+    job: FusionJob,
+    index: LogIndex,
     frame: MapFrame,
-    work_folder: Path,
-    config: MapFusionConfig | None = None,
+    session: ExecutorSession,
     tile_config: TiledFusionConfig = TiledFusionConfig(),
-    executor: Executor | None = None,
     progress: StepProgress | None = None,
 ) -> VectorMap:
-    """Fuse the observations of the log that ``active`` lists; all workers can access ``log_folder`` and ``work_folder``.
+    """Fuse the observations of a log that count, and link them in this process.
 
     Raises:
         FailedObservationsError: the fusion fails with some observations; without them it may succeed.
     """
-    config = config or MapFusionConfig()
-    used: set[str] = set()
-    with (executor or ProcessExecutor()).open() as runner:
 
-        def fuse_rows(rows: Sequence[int]) -> VectorMap:
-            chosen = active if len(rows) == len(active) else _select_active(active, np.array(rows, np.int64))
-            blocks = make_blocks(log_folder, chosen, work_folder, config, tile_config)
-            used.clear()
-            tables = _run_steps(blocks, config, runner, progress, used)
-            return assemble_map(StationTable.cat(tables), config, frame) if tables else VectorMap.empty(frame)
+    def assemble(stations: Sequence[str]) -> VectorMap:
+        return assemble_stations(job, stations, frame)
 
-        fused, failures = isolate_failures(fuse_rows, len(active))
-    if failures:
-        raise FailedObservationsError([FailedObservation(active.ids[one.row], one.reason) for one in failures])
-    # Unused results belong to previous maps; observation arrays are large and cheap to recompute.
-    for path in sorted(work_folder.glob("*.record")):
-        if path.name not in used:
-            path.unlink()
-    return fused
+    return fuse_and(assemble, job, index, tile_config, session, progress)
 
 
-def make_blocks(
-    log_folder: Path,
-    active: ActiveObservations,
-    work_folder: Path,
-    config: MapFusionConfig,
+def fuse_and(
+    use: Callable[[tuple[str, ...]], T],
+    job: FusionJob,
+    index: LogIndex,
     tile_config: TiledFusionConfig,
-) -> list[TileBlock]:
-    """Make every block that contains an observation or that one reaches into, by column and row; empty ones are left out."""
-    size = tile_config.tile_size_m * tile_config.tiles_per_block
-    home = tile_indices(active.xy, size)
-    radius = active.radius_m + tile_config.halo_m
-    low, high = tile_indices(active.xy - radius[:, None], size), tile_indices(active.xy + radius[:, None], size)
-    places = {
-        (x, y)
-        for (x0, y0), (x1, y1) in zip(low.tolist(), high.tolist())
-        for x in range(x0, x1 + 1)
-        for y in range(y0, y1 + 1)
-    }
-    blocks = []
-    for x, y in sorted(places):
+    session: ExecutorSession,
+    progress: StepProgress | None = None,
+) -> T:
+    """Compute the stations of all blocks and give the keys of their tables to ``use``; again where a result is damaged.
+
+    Raises:
+        FailedObservationsError: the fusion fails with some observations; without them it may succeed.
+    """
+    lost: set[str] = set()
+    while True:
+        try:
+            plans = _make_plans(job, index, tile_config)
+            return use(_Run(job, plans, tile_config, session, progress).run())
+        except LostResultError as error:
+            if error.key in lost:
+                raise StoreError(
+                    f"{job.work.location}/{error.key}: expected a step's result, but it cannot be written or read; check the disk."
+                ) from None
+            lost.add(error.key)
+            job.work.delete([error.key])
+
+
+def assemble_stations(job: FusionJob, stations: Sequence[str], frame: MapFrame) -> VectorMap:
+    """Link the stations of all blocks to a map; LostResultError where a table is missing or damaged."""
+    if not stations:
+        return VectorMap.empty(frame)
+    tables = [_load(job, key, StationTable) for key in stations]
+    return assemble_map(StationTable.cat(tables), job.config, frame)
+
+
+def iterate_blocks(index: LogIndex, tile_config: TiledFusionConfig) -> Iterator[TileBlock]:
+    """Yield every block that an observation stands in or reaches into, by column and row, one at a time."""
+    size = tile_config.block_m
+    cells, radius = index.active_cells()
+    halo = radius + tile_config.halo_m
+    reach = max(halo, 2 * radius + tile_config.margin_m)
+    ranges = (
+        product(*(range(int((c * TILE_M - halo) // size), int(((c + 1) * TILE_M + halo) // size) + 1) for c in cell))
+        for cell in cells
+    )
+    for x, y in sorted({place for places in ranges for place in places}):
         area = (x * size, y * size, (x + 1) * size, (y + 1) * size)
-        at_home = np.flatnonzero((home == (x, y)).all(1))
-        chosen = _reaches_area(active, area, tile_config.halo_m)
+        near = index.active_within((area[0] - reach, area[1] - reach, area[2] + reach, area[3] + reach))
+        at_home = np.flatnonzero((tile_indices(near.xy, size) == (x, y)).all(1))
+        chosen = _reaches_area(near, area, tile_config.halo_m)
         chosen[at_home] = True
-        chosen |= _may_interact(active, at_home, tile_config.margin_m)
+        chosen |= _may_interact(near, at_home, tile_config.margin_m)
         rows = np.flatnonzero(chosen)
         if len(rows):
-            ids = tuple(active.ids[k] for k in at_home.tolist())
-            blocks.append(TileBlock(log_folder, _select_active(active, rows), ids, area, work_folder, config))
-    return blocks
+            yield TileBlock((x, y), area, _select_active(near, rows), tuple(near.ids[k] for k in at_home.tolist()))
 
 
-def _run_steps(
-    blocks: Sequence[TileBlock],
-    config: MapFusionConfig,
-    runner: ExecutorSession,
-    progress: StepProgress | None,
-    used: set[str],
-) -> list[StationTable]:
-    """Return stations of all blocks: search, sweeps with a barrier after each, stations; ``used`` gets the names of all
-    results.
-    """
+def _make_plans(job: FusionJob, index: LogIndex, tile_config: TiledFusionConfig) -> list[_Plan]:
+    """Write what each block reads to the job's work, and plan the blocks."""
+    plans = []
+    for block in iterate_blocks(index, tile_config):
+        folder = f"{WORK}/block/{block.place[0]}_{block.place[1]}"
+        (key,) = _put(job.work, folder, {"block": block}, "")
+        home = np.isin(np.array(block.observations.ids), np.array(block.home_ids))
+        xy, solver = block.observations.xy, job.config.pose_solver
+        blocks = np.unique(tile_indices(xy, tile_config.block_m), axis=0).tolist()
+        plans.append(
+            _Plan(
+                block.place,
+                key,
+                tuple((x, y) for x, y in blocks),
+                tuple(list_domains(xy, solver)),
+                tuple(list_domains(xy[home], solver)) if home.any() else (),
+            )
+        )
+    return plans
 
-    def run_all(steps: Sequence[_BlockStep], name: str, kind: type[T]) -> list[T]:
-        report = None if progress is None else partial(progress, name)
-        failures = [failure for found in map_blocks(_run_step, steps, runner, report) for failure in found]
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """One pass over all steps."""
+
+    job: FusionJob
+    plans: list[_Plan]
+    tile_config: TiledFusionConfig
+    session: ExecutorSession
+    progress: StepProgress | None
+
+    def run(self) -> tuple[str, ...]:
+        """Run the search, the steps of the schedule and the stations; the keys of the tables of stations."""
+        homes = [plan for plan in self.plans if plan.home_domains]
+        domains = self._blocks_of_domains(homes)
+        task = partial(StepTask, self.job)
+        searched = self._map("search", (task("search", p.place, 0, (p.members,)) for p in homes), len(homes))
+        poses: dict[Place, str] = dict(zip((p.place for p in homes), (keys[0] for keys in searched)))
+        agents, in_domains = "", False
+
+        def read_by(plan: _Plan) -> tuple[str, ...]:
+            """The keys of the block and of the poses that it reads."""
+            return plan.members, *(poses[place] for place in (plan.domains if in_domains else plan.blocks))
+
+        for number, step in enumerate(self.job.config.pose_solver.schedule):
+            name = f"step {number + 1}"
+            if step.joint is None:
+                ((agents,),) = self._map("", [task("restart", (0, 0), number, (), agents)], 1)
+                tasks = (task("repeat", p.place, number, (p.members,), agents) for p in homes)
+                found = self._map(name, tasks, len(homes))
+                poses, in_domains = dict(zip((p.place for p in homes), (keys[0] for keys in found))), False
+                continue
+            total = len(homes) + len(domains)
+            tasks = (task("pairs", p.place, number, read_by(p), agents) for p in homes)
+            found = self._map(name, tasks, total)
+            pairs = dict(zip((p.place for p in homes), (keys[0] for keys in found)))
+            tasks = (task("solve", d, number, tuple(pairs[b] for b in domains[d])) for d in domains)
+            solved = self._map(name, tasks, total, len(homes))
+            poses, in_domains = dict(zip(domains, (keys[0] for keys in solved))), True
+            agents = self._weigh(number, [keys[1] for keys in solved], agents)
+        tasks = (task("stations", p.place, 0, read_by(p), agents) for p in self.plans)
+        return tuple(keys[0] for keys in self._map("stations", tasks, len(self.plans)))
+
+    def _blocks_of_domains(self, homes: Sequence[_Plan]) -> dict[Place, tuple[Place, ...]]:
+        """Return the blocks whose home observations may lie within the halo of each domain, by column and row."""
+        known, side = {p.place for p in homes}, self.tile_config.block_m
+        solver = self.job.config.pose_solver
+        out = {}
+        for domain in sorted({d for p in homes for d in p.home_domains}):
+            x0, y0, x1, y1 = find_domain_area(domain, solver)
+            ranges = (range(int(low // side), int(high // side) + 1) for low, high in ((x0, x1), (y0, y1)))
+            out[domain] = tuple(place for place in product(*ranges) if place in known)
+        return out
+
+    def _weigh(self, number: int, sums: list[str], agents: str) -> str:
+        """Add the sums of all domains level by level, and weigh the agents; returns the key of their table."""
+        for level in count():
+            if len(sums) <= _FAN_IN:
+                break
+            groups = [tuple(sums[k : k + _FAN_IN]) for k in range(0, len(sums), _FAN_IN)]
+            tasks = (StepTask(self.job, "sums", (level, k), number, group) for k, group in enumerate(groups))
+            sums = [keys[0] for keys in self._map("", tasks, len(groups))]
+        ((table,),) = self._map("", [StepTask(self.job, "weigh", (0, 0), number, tuple(sums), agents)], 1)
+        return table
+
+    def _map(self, name: str, tasks: Iterable[StepTask], total: int, done: int = 0) -> list[tuple[str, ...]]:
+        """Run tasks on the engine; the keys of their results, in order. done: of total, by tasks before them."""
+        keys: dict[int, tuple[str, ...]] = {}
+        failures: list[FailedObservation] = []
+        for index, result in self.session.run(_run_task, tasks):
+            keys[index] = result.keys
+            failures += result.failures
+            if self.progress is not None and name:
+                self.progress(name, done + len(keys), total)
         if failures:
             raise FailedObservationsError(failures)
-        used.update(step.path.name for step in steps)
-        return [_load_result(step, kind) for step in steps]
-
-    if not blocks:
-        return []
-    homes = [b for b in blocks if b.home_ids]
-    steps = [_BlockStep(b, None, -1) for b in homes]
-    state = merge_solutions(run_all(steps, "search", PoseSolution), config.pose_solver)
-    for number in range(config.pose_solver.num_steps):
-        steps = [_BlockStep(b, _select_block(state, b), number) for b in homes]
-        state = merge_solutions(run_all(steps, f"step {number + 1}", PoseSolution), config.pose_solver, number)
-    return run_all([_BlockStep(b, _select_block(state, b), None) for b in blocks], "stations", StationTable)
+        return [keys[index] for index in range(len(keys))]
 
 
-def _select_block(state: PoseSolution, block: TileBlock) -> PoseSolution:
-    """Return the rows of a state that a block reads."""
-    return state.take(state.row_indices(block.observations.ids))
+_NUM_RESULTS = {"solve": 2}
 
 
-def _load_result(step: _BlockStep, kind: type[T]) -> T:
-    """Load the result of a step from the work folder; compute it here if the file is missing or damaged."""
-    found = load_record(step.path, kind)
-    if found is None:
-        step.path.unlink(missing_ok=True)
-        if failures := _run_step(step):
-            raise FailedObservationsError(failures)
-        found = load_record(step.path, kind)
-    if found is None:
-        raise StoreError(f"{step.path}: expected a step's result, but it cannot be written or read; check the disk.")
-    return found
+def _run_task(task: StepTask) -> StepResult:
+    """Run a step and store its results, unless they are stored."""
+    work = task.job.work
+    found = sorted(key for key in work.list(task.folder) if key.startswith(f"{task.folder}/{task.digest}"))
+    if len(found) == _NUM_RESULTS.get(task.kind, 1):
+        return StepResult(tuple(sorted(found, key=lambda key: key.rpartition(".")[2])))
+    results, failures = _compute(task)
+    if failures:
+        return StepResult((), failures)
+    keys = _put(work, task.folder, results, task.digest)
+    if task.kind == "stations":
+        # Arrays are large and cheap to make again.
+        work.delete(work.list(_arrays_folder(task.place)))
+    return StepResult(keys)
 
 
-def _run_step(step: _BlockStep) -> tuple[FailedObservation, ...]:
-    """Run a step and store its result, unless it is stored; return the observations of the block with which it fails."""
-    if step.path.exists():
-        return ()
+def _compute(task: StepTask) -> tuple[dict[str, object], tuple[FailedObservation, ...]]:
+    """Compute the results of a step, by name in order, or find the observations with which it fails."""
+    job, solver = task.job, task.job.config.pose_solver
+    table = _load(job, task.agents, AgentTable) if task.agents else None
+    if task.kind == "restart":
+        assert table is not None
+        return {"agents": table.restart()}, ()
+    if task.kind in ("sums", "weigh"):
+        sums = AgentSums.merge([_load(job, key, AgentSums) for key in task.inputs])
+        if task.kind == "sums":
+            return {"sums": sums}, ()
+        return {"agents": weigh_agents(sums, table, solver.schedule[task.number], solver)}, ()
+    if task.kind == "solve":
+        return _compute_solve(task)
+    block = _load(job, task.inputs[0], TileBlock)
+    poses = [_load(job, key, PoseSolution) for key in task.inputs[1:]]
+    solution = apply_agents(PoseSolution.cat(poses), table) if poses else None
     try:
-        result = _compute_step(step, _load_arrays(step.block))
+        return _compute_block(task, block, _load_arrays(task, block), solution, table), ()
     except CONTENT_ERRORS:
-        result, failures = _isolate_step(step)
-        if failures:
-            return failures
-    save_record(step.path, result)
-    return ()
+        return _isolate_block(task, block, solution, table)
 
 
-def _compute_step(step: _BlockStep, arrays: ObservationArrays) -> PoseSolution | StationTable:
-    """Compute the search, a sweep of a block's home, or the block's stations."""
-    config = step.block.config
-    if step.solution is not None and step.number is None:
-        return build_stations(arrays, step.solution, step.block.area, config.stations)
+def _compute_solve(task: StepTask) -> tuple[dict[str, object], tuple[FailedObservation, ...]]:
+    """Solve a domain, without the observations with which that fails."""
+    solver = task.job.config.pose_solver
+    whole = PoseSolution.cat([_load(task.job, key, PoseSolution) for key in task.inputs])
+
+    def solve(rows: Sequence[int]) -> tuple[PoseSolution, AgentSums]:
+        part = whole.take_with_pairs(np.array(rows, np.int64))
+        return solve_domain([part], task.place, solver.schedule[task.number], solver)
+
+    (state, sums), failures = isolate_failures(solve, len(whole.ids))
+    found = tuple(FailedObservation(whole.ids[one.row], one.reason) for one in failures)
+    return {"poses": state, "sums": sums}, found
+
+
+def _compute_block(
+    task: StepTask, block: TileBlock, arrays: ObservationArrays, solution: PoseSolution | None, table: AgentTable | None
+) -> dict[str, object]:
+    """Compute the search, the sums of a block's home, or the block's stations; solution: poses of all that it reads."""
+    config = task.job.config
+    if solution is not None:
+        solution = solution.take(solution.row_indices(sorted(arrays.ids)))
+    if task.kind == "stations":
+        assert solution is not None
+        return {"stations": build_stations(arrays, solution, block.area, config.stations)}
     row = {name: k for k, name in enumerate(arrays.ids)}
-    home = np.array([row[name] for name in step.block.home_ids], np.int64)
-    if step.solution is None or step.number is None:
-        return search_coarse_poses(arrays, home, config.pose_solver)
-    return run_step(arrays, step.solution, step.number, home, config.pose_solver)
+    home = np.array([row[name] for name in block.home_ids], np.int64)
+    if task.kind == "search":
+        return {"poses": search_coarse_poses(arrays, home, config.pose_solver)}
+    state = apply_agents(make_initial_solution(arrays), table) if solution is None else solution
+    return {"poses": run_step(arrays, state, task.number, home, config.pose_solver)}
 
 
-def _isolate_step(step: _BlockStep) -> tuple[PoseSolution | StationTable, tuple[FailedObservation, ...]]:
+def _isolate_block(
+    task: StepTask, block: TileBlock, solution: PoseSolution | None, table: AgentTable | None
+) -> tuple[dict[str, object], tuple[FailedObservation, ...]]:
     """Compute a step without the observations with which it fails; raises its error where leaving some out does not help."""
-    block, config = step.block, step.block.config
-    stored = read_active(block.log_folder, block.observations, np.arange(len(block.observations)))
+    active = block.observations
+    stored = read_active(task.job.log, active, np.arange(len(active)))
     home = set(block.home_ids)
     # Home first: only with home observations does a step compute anything.
     ordered = sorted(stored, key=lambda o: (o.id not in home, o.id))
 
-    def compute(rows: Sequence[int]) -> PoseSolution | StationTable:
+    def compute(rows: Sequence[int]) -> dict[str, object]:
         chosen = [ordered[row] for row in rows]
-        arrays = to_observation_arrays(chosen, config.pose_solver.spacing_m)
+        arrays = to_observation_arrays(chosen, task.job.config.pose_solver.spacing_m)
         part = replace(block, home_ids=tuple(o.id for o in chosen if o.id in home))
-        solution = None if step.solution is None else step.solution.take(step.solution.row_indices(sorted(arrays.ids)))
-        return _compute_step(replace(step, block=part, solution=solution), arrays)
+        return _compute_block(task, part, arrays, solution, table)
 
-    result, failures = isolate_failures(compute, len(ordered))
-    return result, tuple(FailedObservation(ordered[one.row].id, one.reason) for one in failures)
+    results, failures = isolate_failures(compute, len(ordered))
+    return results, tuple(FailedObservation(ordered[one.row].id, one.reason) for one in failures)
 
 
-def _load_arrays(block: TileBlock) -> ObservationArrays:
-    """Load the block's observations as arrays from the work folder, or make and store them."""
-    path = block.work_folder / f"{block.key}.arrays.record"
-    found = load_record(path, ObservationArrays)
+def _load_arrays(task: StepTask, block: TileBlock) -> ObservationArrays:
+    """Load the block's observations as arrays from the job's work, or make and store them."""
+    job, key = task.job, f"{_arrays_folder(block.place)}/{_content_digest(task.inputs[0])}"
+    try:
+        found = unpack_record(job.work.get(key), ObservationArrays)
+    except ObjectNotFoundError:
+        found = None
     if found is None:
-        rows = np.arange(len(block.observations))
-        found = to_observation_arrays(
-            read_active(block.log_folder, block.observations, rows), block.config.pose_solver.spacing_m
-        )
-        save_record(path, found)
+        observations = read_active(job.log, block.observations, np.arange(len(block.observations)))
+        found = to_observation_arrays(observations, job.config.pose_solver.spacing_m)
+        job.work.put(key, pack_record(found), durable=False)
     return found
+
+
+def _arrays_folder(place: Place) -> str:
+    return f"{WORK}/arrays/{place[0]}_{place[1]}"
+
+
+def _put(work: ObjectStore, folder: str, results: dict[str, Any], made_from: str) -> tuple[str, ...]:
+    """Store results by name, each under a key that ends with a hash of its content; they take the place of what was there."""
+    before, keys = set(work.list(folder)), []
+    for name, value in results.items():
+        data = pack_record(value)
+        keys.append(f"{folder}/{made_from}-{hashlib.blake2b(data, digest_size=16).hexdigest()}.{name}")
+        if keys[-1] not in before:
+            work.put(keys[-1], data, durable=False)
+    work.delete(sorted(before - set(keys)))
+    return tuple(keys)
+
+
+def _load(job: FusionJob, key: str, kind: type[T]) -> T:
+    """Load a result of a step; LostResultError where it is missing or damaged."""
+    try:
+        data = job.work.get(key)
+    except ObjectNotFoundError:
+        raise LostResultError(key) from None
+    whole = hashlib.blake2b(data, digest_size=16).hexdigest() == _content_digest(key)
+    found = unpack_record(data, kind) if whole else None
+    if found is None:
+        raise LostResultError(key)
+    return found
+
+
+def _content_digest(key: str) -> str:
+    return key.rpartition("-")[2].partition(".")[0] if "." in key else key
+
+
+@lru_cache(maxsize=1)
+def _code() -> str:
+    return f"{ALGORITHM} {source_digest(__name__)}"
 
 
 def _reaches_area(active: ActiveObservations, area: Area, halo_m: float) -> NDArray[np.bool_]:
@@ -308,7 +507,7 @@ def _may_interact(active: ActiveObservations, home: Ints, margin_m: float) -> ND
         ((active.xy >= low - max_distance[:, None]) & (active.xy <= high + max_distance[:, None])).all(1)
     )
     # In slices, so that the table of distances stays small.
-    for rows in np.array_split(near, max(1, len(near) * len(home) // 2_000_000)):
+    for rows in np.array_split(near, max(1, len(near) * len(home) // 200_000)):
         gap = np.hypot(*(active.xy[rows, None] - xy).transpose(2, 0, 1))
         out[rows] = (gap <= active.radius_m[rows, None] + radius + margin_m).any(1)
     return out
