@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A map fused tile by tile is the map fused in one piece, on any engine, after a kill, and after a few more observations."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -15,10 +16,18 @@ from manyeyes.maps.fusion.pose_config import PoseSolverConfig
 from manyeyes.maps.fusion.pose_optimization import list_domains, solve_poses
 from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT
 from manyeyes.maps.store.executors import InlineExecutor, make_executor
+from manyeyes.maps.store.log_index import IndexRow, LogIndex
 from manyeyes.maps.store.object_store import FolderStore
 from manyeyes.maps.store.observation_log import read_active
 from manyeyes.maps.store.store import MapStore
-from manyeyes.maps.store.tiled_fusion import FusionJob, TiledFusionConfig, fuse_tiles, iterate_blocks
+from manyeyes.maps.store.tiled_fusion import (
+    FusionJob,
+    StepResult,
+    TiledFusionConfig,
+    fuse_and,
+    fuse_tiles,
+    iterate_blocks,
+)
 from manyeyes.simulator.fleet import CROWDS, load_place, simulate_crowd
 
 pytest.importorskip("pyarrow", reason="the map extra is not installed")
@@ -175,3 +184,43 @@ def test_observation_arrays_round_trip_through_work_folder(store, tmp_path):
 def test_sizes_that_make_no_sense_are_refused():
     with pytest.raises(ConfigError, match="TiledFusionConfig"):
         TiledFusionConfig(tile_size_m=0.0)
+
+
+class NoWork:
+    """An object store that keeps nothing, and an engine whose workers return names at once."""
+
+    location = "nowhere"
+
+    def list(self, _):
+        return []
+
+    def put(self, *_, **__):
+        pass
+
+    def delete(self, _):
+        pass
+
+    def run(self, _, tasks):
+        for index, task in enumerate(tasks):
+            names = ("poses", "sums") if task.kind == "solve" else ("poses",)
+            yield index, StepResult(tuple(f"{task.folder}/{'0' * 32}-{'1' * 32}.{name}" for name in names))
+
+
+def test_what_the_driver_holds_grows_by_names_of_blocks_alone(tmp_path):
+    """Sixteen and a hundred blocks of one density: 25 observations a block."""
+    peaks, blocks = [], []
+    for side in (4, 10):
+        index = LogIndex(tmp_path / f"{side}.sqlite")
+        index.clear("")
+        places = np.stack(np.meshgrid(*[np.arange(side * 5) * 102.4 + 1.0] * 2), -1).reshape(-1, 2).tolist()
+        rows = [IndexRow(f"{k:032x}", k // 128, k, f"car{k % 7}", x, y, 51.0, "p") for k, (x, y) in enumerate(places)]
+        index.add_segment("1.parquet", rows)
+        job, nowhere = FusionJob(NoWork(), NoWork(), MapFusionConfig()), NoWork()
+        tracemalloc.start()
+        stations = fuse_and(tuple, job, index, TiledFusionConfig(), nowhere)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        blocks.append(len(stations))
+    assert blocks[0] < 40 and blocks[1] > 100
+    # An observation with its id and place takes some 300 bytes; a block of this density holds 25, a dense one thousands.
+    assert (peaks[1] - peaks[0]) / (blocks[1] - blocks[0]) < 5000
