@@ -131,6 +131,7 @@ class LogIndex:
             for name in _SCHEMA:
                 db.execute(f"DROP TABLE IF EXISTS {name}")
             _create_tables(db)
+            db.execute("CREATE INDEX by_cell ON observations (cell_x, cell_y)")
             db.execute("INSERT INTO checked VALUES (?)", (limits,))
             db.execute(f"PRAGMA user_version = {_VERSION}")
 
@@ -281,4 +282,3 @@ def _to_active(rows: list[tuple[Any, ...]]) -> ActiveObservations:
 def _create_tables(db: sqlite3.Connection) -> None:
     for name, columns in _SCHEMA.items():
         db.execute(f"CREATE TABLE IF NOT EXISTS {name} {columns}")
-    db.execute("CREATE INDEX IF NOT EXISTS by_cell ON observations (cell_x, cell_y)")

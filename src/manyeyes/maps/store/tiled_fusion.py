@@ -275,6 +275,8 @@ class _Run:
 
     def run(self) -> tuple[str, ...]:
         """Run the search, the steps of the schedule and the stations; the keys of the tables of stations."""
+        if not self.plans:
+            return ()
         homes = [plan for plan in self.plans if plan.home_domains]
         domains = self._blocks_of_domains(homes)
         task = partial(StepTask, self.job)
