@@ -71,7 +71,7 @@ class AgentSums:
 
 
 @dataclass(frozen=True, eq=False)
-class AgentTable:
+class AgentWeights:
     """Weight (A,) in (0, 1] and residual scale (A,) in metres of agents, names ascending."""
 
     names: tuple[str, ...]
@@ -79,7 +79,7 @@ class AgentTable:
     scale: Floats
 
     @classmethod
-    def of_state(cls, state: PoseSolution) -> AgentTable:
+    def of_state(cls, state: PoseSolution) -> AgentWeights:
         """Collect what the observations of a state carry; surveyed poles leave the weight at 1."""
         names, agent = np.unique(np.array(state.agents), return_inverse=True)
         weight, scale = np.ones(len(names)), np.full(len(names), START_SCALE_M)
@@ -89,7 +89,9 @@ class AgentTable:
         return cls(tuple(names.tolist()), weight, scale)
 
     @classmethod
-    def of_sums(cls, found: AgentSums, previous: AgentTable | None, decides: bool, limits: AgentLimits) -> AgentTable:
+    def of_sums(
+        cls, found: AgentSums, previous: AgentWeights | None, decides: bool, limits: AgentLimits
+    ) -> AgentWeights:
         """Weigh agents; only a step that decides rejects or reinstates one."""
         values = found.sums / _UNITS
         weight = _weigh(
@@ -100,10 +102,10 @@ class AgentTable:
         variance = values[:, _SQUARES] + _PRIOR_VOTES * START_SCALE_M**2
         return cls(found.names, weight, np.sqrt(variance / (values[:, _VOTES] + _PRIOR_VOTES)))
 
-    def restart(self) -> AgentTable:
+    def restart(self) -> AgentWeights:
         """Return the table at the start of a pass: agents are inliers, or rejected."""
         weight = np.where(self.weight > REJECTED_WEIGHT, 1.0, REJECTED_WEIGHT)
-        return AgentTable(self.names, weight, np.full(len(weight), START_SCALE_M))
+        return AgentWeights(self.names, weight, np.full(len(weight), START_SCALE_M))
 
     def rows(self, names: Sequence[str]) -> Ints:
         """Return the rows of agents."""
@@ -145,11 +147,11 @@ def estimate_agent_weights(
     """
     none = np.zeros(len(offset))
     columns = make_agent_columns(offset, observability, prior_variance, none, none)
-    table = AgentTable.of_sums(AgentSums.of([str(a) for a in agent], columns), None, True, limits)
+    table = AgentWeights.of_sums(AgentSums.of([str(a) for a in agent], columns), None, True, limits)
     return table.weight[table.rows([str(a) for a in agent])]
 
 
-def apply_agents(state: PoseSolution, table: AgentTable | None) -> PoseSolution:
+def apply_agents(state: PoseSolution, table: AgentWeights | None) -> PoseSolution:
     """Return the state with the weights and scales of a table; surveyed poles have weight 1. None: as it is."""
     if table is None:
         return state

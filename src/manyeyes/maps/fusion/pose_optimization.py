@@ -34,7 +34,7 @@ from manyeyes.maps.fusion.agent_weights import (
     NUM_COLUMNS,
     AgentLimits,
     AgentSums,
-    AgentTable,
+    AgentWeights,
     apply_agents,
     make_agent_columns,
 )
@@ -216,7 +216,7 @@ def merge_solutions(
         state, found = _select_domain(*solved, domain, config)
         states.append(state)
         sums.append(found)
-    table = weigh_agents(AgentSums.merge(sums), AgentTable.of_state(whole), step, config)
+    table = weigh_agents(AgentSums.merge(sums), AgentWeights.of_state(whole), step, config)
     return apply_agents(PoseSolution.cat(states), table)
 
 
@@ -289,11 +289,11 @@ def _solve_near(near: PoseSolution, step: SolverStep, config: PoseSolverConfig) 
 
 
 def weigh_agents(
-    sums: AgentSums, previous: AgentTable | None, step: SolverStep, config: PoseSolverConfig = DEFAULT_ALIGN
-) -> AgentTable:
+    sums: AgentSums, previous: AgentWeights | None, step: SolverStep, config: PoseSolverConfig = DEFAULT_ALIGN
+) -> AgentWeights:
     """Weigh all agents after a joint step."""
     limits = AgentLimits(config.agent_tolerance, config.agent_scale, config.max_agent_error, config.drive_fraction)
-    return AgentTable.of_sums(sums, previous, step.decides, limits)
+    return AgentWeights.of_sums(sums, previous, step.decides, limits)
 
 
 def _assemble_blocks(pairs: PairSums, ids: Sequence[str]) -> PairBlocks:

@@ -83,7 +83,7 @@ class FolderStore:
 
     @property
     def location(self) -> str:
-        """The folder."""
+        """The folder, as a text."""
         return str(self.folder)
 
     def put(self, key: str, data: bytes, durable: bool = True) -> None:
@@ -98,12 +98,12 @@ class FolderStore:
         return True
 
     def get(self, key: str) -> bytes:
-        """Read a file."""
+        """Read a whole file."""
         with self._naming(key):
             return (self.folder / key).read_bytes()
 
     def open(self, key: str) -> IO[bytes]:
-        """Open a file."""
+        """Open a file to read."""
         with self._naming(key):
             return (self.folder / key).open("rb")
 
@@ -125,7 +125,7 @@ class FolderStore:
         )
 
     def delete(self, keys: Sequence[str]) -> None:
-        """Delete files."""
+        """Delete files that are there."""
         for key in keys:
             (self.folder / key).unlink(missing_ok=True)
 
@@ -151,7 +151,7 @@ class UrlStore:
 
     @property
     def location(self) -> str:
-        """The URL."""
+        """The URL, as it was given."""
         return self.url
 
     @property
@@ -159,7 +159,7 @@ class UrlStore:
         return str(_file_system(self.url, self.options)._strip_protocol(self.url)).rstrip("/")
 
     def put(self, key: str, data: bytes, durable: bool = True) -> None:
-        """Write an object."""
+        """Write an object as one request."""
         with self._naming(key) as files:
             files.pipe_file(f"{self._root}/{key}", data)
 
@@ -173,7 +173,7 @@ class UrlStore:
         return True
 
     def get(self, key: str) -> bytes:
-        """Read an object."""
+        """Read a whole object."""
         with self._naming(key) as files:
             return files.cat_file(f"{self._root}/{key}")
 
@@ -191,7 +191,7 @@ class UrlStore:
             return sorted(name[start:] for name in files.find(f"{self._root}/{folder.rstrip('/')}"))
 
     def delete(self, keys: Sequence[str]) -> None:
-        """Delete objects."""
+        """Delete objects that are there."""
         for key in keys:
             with contextlib.suppress(ObjectNotFoundError), self._naming(key) as files:
                 files.rm_file(f"{self._root}/{key}")

@@ -29,7 +29,7 @@ from manyeyes._source import source_digest
 from manyeyes.datatypes import ConfigError
 from manyeyes.maps.elements.observation import MapFrame
 from manyeyes.maps.elements.vector_map import VectorMap
-from manyeyes.maps.fusion.agent_weights import AgentSums, AgentTable, apply_agents
+from manyeyes.maps.fusion.agent_weights import AgentSums, AgentWeights, apply_agents
 from manyeyes.maps.fusion.fuse import MapFusionConfig, assemble_map
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays, to_observation_arrays
 from manyeyes.maps.fusion.pose_optimization import (
@@ -365,7 +365,7 @@ def _run_task(task: StepTask) -> StepResult:
 def _compute(task: StepTask) -> tuple[dict[str, object], tuple[FailedObservation, ...]]:
     """Compute the results of a step, by name in order, or find the observations with which it fails."""
     job, solver = task.job, task.job.config.pose_solver
-    table = _load(job, task.agents, AgentTable) if task.agents else None
+    table = _load(job, task.agents, AgentWeights) if task.agents else None
     if task.kind == "restart":
         assert table is not None
         return {"agents": table.restart()}, ()
@@ -400,7 +400,11 @@ def _compute_solve(task: StepTask) -> tuple[dict[str, object], tuple[FailedObser
 
 
 def _compute_block(
-    task: StepTask, block: TileBlock, arrays: ObservationArrays, solution: PoseSolution | None, table: AgentTable | None
+    task: StepTask,
+    block: TileBlock,
+    arrays: ObservationArrays,
+    solution: PoseSolution | None,
+    table: AgentWeights | None,
 ) -> dict[str, object]:
     """Compute the search, the sums of a block's home, or the block's stations; solution: poses of all that it reads."""
     config = task.job.config
@@ -418,7 +422,7 @@ def _compute_block(
 
 
 def _isolate_block(
-    task: StepTask, block: TileBlock, solution: PoseSolution | None, table: AgentTable | None
+    task: StepTask, block: TileBlock, solution: PoseSolution | None, table: AgentWeights | None
 ) -> tuple[dict[str, object], tuple[FailedObservation, ...]]:
     """Compute a step without the observations with which it fails; raises its error where leaving some out does not help."""
     active = block.observations
