@@ -258,7 +258,7 @@ def test_two_writers_do_not_meet(tmp_path):
 
 @pytest.mark.slow
 def test_a_writer_killed_at_any_moment_leaves_a_whole_release_and_a_whole_log():
-    step, timed = 11, 2
+    step, timed = 8, 2
     script = Path(__file__).with_name("killed_writer.py")
     # In memory where that can be had: a kill, unlike a loss of power, does not ask what has reached the disk.
     memory = Path("/dev/shm")
