@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import BOUNDARY, DIVIDER, MapElements
+from manyeyes.evaluation.maps.experiment import FleetTrial, run_trial
+from manyeyes.evaluation.maps.registry import make_tuned_settings
 from manyeyes.maps.elements.observation import Observation
 from manyeyes.maps.fusion import pose_optimization
 from manyeyes.maps.fusion.agent_weights import AgentLimits, estimate_agent_weights
+from manyeyes.maps.fusion.coarse_search import find_isolated_shifts
 from manyeyes.maps.fusion.joint_solver import (
     assemble_joint_system,
     compute_marginal_covariance,
@@ -23,6 +26,8 @@ from manyeyes.maps.fusion.observation_arrays import to_observation_arrays
 from manyeyes.maps.fusion.pose_config import JointIteration, PoseSolverConfig
 from manyeyes.maps.fusion.pose_optimization import solve_poses
 from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT, make_initial_solution
+from manyeyes.simulator.fleet.config import CROWDS
+from manyeyes.simulator.fleet.simulate import HONEST, OUTLIER
 
 VIEW = np.array([[-20.0, -10.0], [20.0, -10.0], [20.0, 10.0], [-20.0, 10.0]])
 P = np.diag([0.16, 0.16, 1e-4])
@@ -256,3 +261,41 @@ def test_agent_beyond_limit_is_rejected_only_where_observable():
     assert agent_weights([(3.0, 0.0)] * 4, [0] * 4, observability=0.0) == pytest.approx(1.0)
     mixed = agent_weights([(3.0, 0.0)] * 3 + [(0.1, 0.0)] * 3, [0] * 3 + [1] * 3)
     assert (mixed[:3] == REJECTED_WEIGHT).all() and (mixed[3:] > 0.95).all()
+
+
+def isolated(shifted, drives=None, step_m=40.0):
+    count = len(shifted)
+    xy = np.stack((np.arange(count) * step_m, np.zeros(count)), 1).astype(np.float64)
+    rows = np.random.default_rng(0).permutation(count)  # the order of the observations has no effect
+    found = np.empty(count, bool)
+    names = drives or "a" * count
+    found[rows] = find_isolated_shifts(tuple(names[k] for k in rows), xy[rows], np.array(shifted, bool)[rows], 300.0)
+    return found.astype(int).tolist()
+
+
+def test_a_shift_alone_in_its_drive_is_isolated_and_one_of_a_majority_is_not():
+    assert isolated([0, 1, 0, 0]) == [0, 1, 0, 0]
+    assert isolated([1, 1, 0, 1]) == [0, 0, 0, 0]
+    assert isolated([1]) == [0], "a drive of one observation has nothing that contradicts it"
+    assert isolated([1, 0]) == [1, 0] and isolated([]) == []
+
+
+def test_isolation_counts_the_same_drive_nearby_alone():
+    assert isolated([1, 1, 0, 0], drives="abab") == [1, 1, 0, 0]
+    assert isolated([1, 1, 0, 0], drives="aabb") == [0, 0, 0, 0]
+    far = isolated([1, 1, 1] + 9 * [0], step_m=140.0)
+    assert far[0] == 0, "two of three within 300 m are shifted, though a minority of the drive"
+
+
+@pytest.mark.slow
+def test_honest_observations_are_not_locked_on_the_next_lane():
+    """On the tuning place cross a drive was rejected since one of its looks was moved by a lane."""
+    experiment = run_trial(FleetTrial("cross", 60, 3000, fleet_config=CROWDS["local"]))
+    solution = solve_poses(experiment.observations, make_tuned_settings().config_of("manyeyes").pose_solver)
+    rows = solution.row_indices([o.id for o in experiment.observations])
+    true, honest = experiment.fleet.true_poses, experiment.fleet.roles == HONEST
+    error = solution.pose[rows] - true
+    lateral = np.abs(np.cos(true[:, 2]) * error[:, 1] - np.sin(true[:, 2]) * error[:, 0])[honest]
+    assert honest.sum() == 56 and lateral.max() < 1.5
+    assert (solution.agent_weight[rows][honest] < 0.1).sum() == 0
+    assert (solution.agent_weight[rows][experiment.fleet.roles == OUTLIER] < 0.1).all()

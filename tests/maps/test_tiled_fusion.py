@@ -96,7 +96,7 @@ def test_rejected_agents_are_rejected_alike_in_tiles_and_in_one_piece(tmp_path):
         CROWDS["local"], malicious_fraction=0.2, attack_mode="colluding", malicious_offset_m=(3.0, 3.0)
     )
     simulated = simulate_crowd(load_place("cross"), COUNT, crowd_config, seed=6)
-    assert (solve_poses(simulated.observations).agent_weight == REJECTED_WEIGHT).sum() > 3
+    assert (solve_poses(simulated.observations).agent_weight == REJECTED_WEIGHT).sum() >= 3
     made = MapStore.create(tmp_path / "store", simulated.place.frame)
     with made.open_for_writing() as log:
         log.append(simulated.observations)
@@ -117,8 +117,11 @@ def test_finished_steps_are_found_again_and_a_damaged_one_is_done_again(store, w
     schedule = MapFusionConfig().pose_solver.schedule
     joint = sum(step.joint is not None for step in schedule)
     results = objects.list("work")
-    # Per block: its rows of the index, the search, pairs or a search a step, stations; of the one domain two a joint step; agents.
-    assert len(results) == 4 * (steps + 3) + 2 * joint + steps and not [k for k in results if "/arrays/" in k]
+    # Per block: its rows of the index, the search, pairs or a search a step, stations; of the one domain one a search and two a
+    # joint step; agents.
+    assert len(results) == 4 * (steps + 3) + (steps - joint + 1) + 2 * joint + steps and not [
+        k for k in results if "/arrays/" in k
+    ]
     before = {key: (work / key).stat().st_mtime_ns for key in results}
     stations = [key for key in results if "/stations-" in key]
     (work / stations[0]).write_bytes((work / stations[0]).read_bytes()[:100])

@@ -17,6 +17,7 @@ from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
 from manyeyes.evaluation.maps import adversarial
 from manyeyes.evaluation.maps.adversarial import make_attacks, measure_displacement
 from manyeyes.evaluation.maps.experiment import FleetTrial, replace_poses, run_trial
+from manyeyes.evaluation.maps.malicious_agents import AgentErrors
 from manyeyes.evaluation.maps.metrics import THRESHOLDS, KindAp, KindMetrics, LengthScore, MapMetrics, evaluate_map
 from manyeyes.evaluation.maps.oracles import fuse_with_true_association, split_in_half
 from manyeyes.evaluation.maps.registry import (
@@ -35,7 +36,7 @@ from manyeyes.simulator.fleet.config import CROWDS
 from manyeyes.simulator.fleet.simulate import HONEST, MALICIOUS
 from manyeyes.studies.engine.cells import CellStore
 from manyeyes.studies.engine.report import StudyContext
-from manyeyes.studies.maps import fleet_cells
+from manyeyes.studies.maps import fleet_cells, malicious_agents as malicious_study
 from manyeyes.studies.maps.adversarial import AdversarialJob
 from manyeyes.studies.maps.fleet_cells import FleetJob, FleetResult, make_cell
 from manyeyes.studies.maps.fusion import (
@@ -46,7 +47,12 @@ from manyeyes.studies.maps.fusion import (
     run,
 )
 from manyeyes.studies.maps.tuning import SEARCH_SPACE, sample_changes
-from manyeyes.studies.options import FleetPoseNoiseOptions, FusionOptions, MapFusionStudyOptions
+from manyeyes.studies.options import (
+    FleetPoseNoiseOptions,
+    FusionOptions,
+    MaliciousAgentsOptions,
+    MapFusionStudyOptions,
+)
 
 
 def make_kind(kind: str, ap: float, f: float, dup: float) -> KindMetrics:
@@ -269,3 +275,34 @@ def test_an_unknown_method_is_refused_before_the_first_trial(tmp_path, monkeypat
     )
     with pytest.raises(ConfigError, match="guess"):
         run(options, StudyContext("fusion", options, Console(quiet=True)))
+
+
+def test_detection_of_malicious_agents_is_tabulated_and_goes_on(monkeypatch, tmp_path) -> None:
+    def measure(trial: FleetTrial, _settings: MethodSettings) -> AgentErrors:
+        config = trial.fleet_config
+        offset = config.malicious_offset_m[0]
+        return AgentErrors(
+            trial.place,
+            trial.seed,
+            config.attack_mode,
+            config.malicious_fraction,
+            offset,
+            (0.5, 1.5),
+            (offset,),
+            (0, 8),
+        )
+
+    monkeypatch.setattr(malicious_study, "measure_agent_errors", measure)
+    options = MaliciousAgentsOptions(
+        places=("cross",), seeds=2, fractions=(0.1, 0.4), offsets_m=(1.0, 2.0), workers=1, out=tmp_path
+    )
+    context = StudyContext("malicious-agents", options, Console(quiet=True))
+    malicious_study.run(options, context)
+    rows = json.loads((tmp_path / "malicious-agents.json").read_text())["result"]["rows"]
+    assert [(r["attack"], r["fraction"], r["offset_m"], r["roc"]["area"]) for r in rows] == [
+        (attack, fraction, offset, 0.5 if offset == 1.0 else 1.0)
+        for fraction in (0.1, 0.4) for attack in ("independent", "colluding") for offset in (1.0, 2.0)
+    ]  # fmt: skip
+    assert (tmp_path / "malicious-agents.png").stat().st_size > 10_000
+    monkeypatch.setattr(malicious_study, "measure_agent_errors", lambda *_: pytest.fail("computed again"))
+    malicious_study.run(options, context)

@@ -189,6 +189,7 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
     "study fleet-pose-noise": (_SHAPELY,),
     "study crowdmap-table3": (_SHAPELY,),
     "study adversarial": (_SHAPELY,),
+    "study malicious-agents": (_SHAPELY, _MATPLOTLIB),
     "study tuning": (_SHAPELY,),
 }
 """Requirements of every command, studies included."""

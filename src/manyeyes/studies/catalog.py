@@ -79,6 +79,9 @@ STUDIES = {
         "maps.fusion", "MapFusionStudyOptions"),
     "adversarial": Study(
         _FLEET, "displacement of the map by malicious agents", "maps.adversarial", "AdversarialOptions"),
+    "malicious-agents": Study(
+        _FLEET, "ROC of detecting malicious agents, by attack, fraction and offset",
+        "maps.malicious_agents", "MaliciousAgentsOptions"),
     "tuning": Study(
         _FLEET, "hyperparameter search with equal budgets, on other places", "maps.tuning", "TuningOptions"),
 }  # fmt: skip

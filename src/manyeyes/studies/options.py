@@ -12,6 +12,7 @@ from manyeyes._bounds import (
     AngleDeg,
     ByteCount,
     DurationS,
+    Fraction,
     LengthM,
     OutputFolder,
     PositiveInt,
@@ -287,6 +288,16 @@ class AdversarialOptions(FleetStudyOptions):
 
     places: tuple[str, ...] = ()
     """Places; by default the four test places."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaliciousAgentsOptions(AdversarialOptions):
+    """Options of the study malicious-agents."""
+
+    fractions: tuple[Fraction, ...] = (0.1, 0.2, 0.3, 0.4)
+    """Fractions of agents that are malicious."""
+    offsets_m: tuple[LengthM, ...] = (0.25, 0.5, 1.0, 2.0, 4.0)
+    """Metres by which they displace what they observe."""
 
 
 @dataclass(frozen=True, kw_only=True)

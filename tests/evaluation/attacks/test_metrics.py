@@ -9,7 +9,6 @@ import torch
 from manyeyes.agents.trust.interface import Evidence
 from manyeyes.evaluation.attacks.metrics import (
     EventRate,
-    Proportion,
     count_false_accusations,
     detection_rate,
     make_roc,
@@ -19,6 +18,7 @@ from manyeyes.evaluation.attacks.metrics import (
 from manyeyes.evaluation.attacks.records import ClaimRecord, DriveRecord, SenderRecord
 from manyeyes.evaluation.attacks.removed_objects import count_removed
 from manyeyes.evaluation.detection.frame_match import FrameMatch
+from manyeyes.evaluation.statistics.proportion import Proportion
 
 
 def sender(number: int, malicious: bool, named: list[int], trust: list[float] | None = None) -> SenderRecord:

@@ -20,41 +20,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import beta, chi2
+from scipy.stats import chi2
 
 from manyeyes.agents.trust.interface import Evidence
 from manyeyes.evaluation.attacks.records import ClaimRecord, DriveRecord, SenderRecord
 from manyeyes.evaluation.attacks.sight import is_checkable
+from manyeyes.evaluation.statistics.proportion import CONFIDENCE_LEVEL, Proportion
+from manyeyes.evaluation.statistics.roc import RocCurve, compute_roc
 
-CONFIDENCE_LEVEL = 0.95
 MIN_SCORE, MIN_TRUST = 0.5, 0.8
 MARKED = (int(Evidence.UNCHECKED), int(Evidence.DISPUTED))
 """Evidence that marks a box as one that nothing confirms."""
 FIRST_FRAMES = (5, 10)
-NUM_ROC_POINTS = 101
-
-
-@dataclass(frozen=True)
-class Proportion:
-    """successes of total, with the Clopper-Pearson interval; NaN-free: 0 to 1 without trials."""
-
-    successes: int
-    total: int
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, successes: int, total: int) -> Proportion:
-        """Return the proportion with its two-sided interval."""
-        tail = (1 - CONFIDENCE_LEVEL) / 2
-        low = float(beta.ppf(tail, successes, total - successes + 1)) if successes else 0.0
-        high = float(beta.ppf(1 - tail, successes + 1, total - successes)) if successes < total else 1.0
-        return cls(successes, total, low, high)
-
-    @property
-    def value(self) -> float:
-        """The observed fraction; NaN without trials."""
-        return self.successes / self.total if self.total else float("nan")
 
 
 @dataclass(frozen=True)
@@ -81,17 +58,6 @@ class EventRate:
     def value(self) -> float:
         """Events per minute; NaN without time."""
         return self.events / self.minutes if self.minutes > 0 else float("nan")
-
-
-@dataclass(frozen=True)
-class RocCurve:
-    """false_positive and true_positive rates at falling thresholds, from 0 to 1; area under it, and the numbers of both classes."""
-
-    false_positive: tuple[float, ...]
-    true_positive: tuple[float, ...]
-    area: float
-    num_positive: int
-    num_negative: int
 
 
 def count_false_accusations(drives: Sequence[DriveRecord]) -> EventRate:
@@ -185,15 +151,4 @@ def make_roc(drives: Sequence[DriveRecord]) -> RocCurve | None:
             received = sender.is_received.numpy()
             suspicion.append(1 - sender.trust.numpy()[received])
             positive.append(np.full(int(received.sum()), sender.is_malicious))
-    score, is_positive = np.concatenate(suspicion), np.concatenate(positive)
-    num_positive, num_negative = int(is_positive.sum()), int((~is_positive).sum())
-    if not num_positive or not num_negative:
-        return None
-    order = np.argsort(-score, kind="stable")
-    ends = np.append(np.flatnonzero(np.diff(score[order])), len(score) - 1)
-    true_positive = np.append(0, np.cumsum(is_positive[order])[ends] / num_positive)
-    false_positive = np.append(0, np.cumsum(~is_positive[order])[ends] / num_negative)
-    area = float(np.sum(np.diff(false_positive) * (true_positive[1:] + true_positive[:-1]) / 2))
-    x = np.linspace(0, 1, NUM_ROC_POINTS)
-    last = np.searchsorted(false_positive, x, side="right") - 1
-    return RocCurve(tuple(x.tolist()), tuple(true_positive[last].tolist()), area, num_positive, num_negative)
+    return compute_roc(np.concatenate(suspicion), np.concatenate(positive))

@@ -56,9 +56,12 @@ class AdversarialResult:
 
 
 def make_attacks(
-    places: Sequence[str], seeds: Sequence[int], offsets_m: Sequence[float] = OFFSETS_M
+    places: Sequence[str],
+    seeds: Sequence[int],
+    offsets_m: Sequence[float] = OFFSETS_M,
+    fraction: float = MALICIOUS_FRACTION,
 ) -> list[FleetTrial]:
-    """Make the trials: places, seeds, both attack modes, and every offset."""
+    """Make the trials: places, seeds, both attack modes, and every offset; fraction: of agents that are malicious."""
     return [
         FleetTrial(
             place,
@@ -67,7 +70,7 @@ def make_attacks(
             view_label=attack,
             fleet_config=replace(
                 CROWDS["local"],
-                malicious_fraction=MALICIOUS_FRACTION,
+                malicious_fraction=fraction,
                 attack_mode=attack,
                 malicious_offset_m=(offset, offset),
             ),

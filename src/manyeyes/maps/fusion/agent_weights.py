@@ -7,7 +7,7 @@ The sums are integers of a fixed unit, so that they are exact and the same for a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,9 +72,10 @@ class AgentSums:
 
 @dataclass(frozen=True, eq=False)
 class AgentWeights:
-    """Weight (A,) in (0, 1] and residual scale (A,) in metres of agents, names ascending."""
+    """Error (A,) in standard deviations, weight (A,) in (0, 1] and residual scale (A,) in metres of agents, names ascending."""
 
     names: tuple[str, ...]
+    error: Floats
     weight: Floats
     scale: Floats
 
@@ -82,11 +83,11 @@ class AgentWeights:
     def of_state(cls, state: PoseSolution) -> AgentWeights:
         """Collect what the observations of a state carry; surveyed poles leave the weight at 1."""
         names, agent = np.unique(np.array(state.agents), return_inverse=True)
-        weight, scale = np.ones(len(names)), np.full(len(names), START_SCALE_M)
+        weight, scale, error = np.ones(len(names)), np.full(len(names), START_SCALE_M), np.zeros(len(names))
         weighted = state.is_surveyed == 0
         weight[agent[weighted]] = state.agent_weight[weighted]
-        scale[agent] = state.scale
-        return cls(tuple(names.tolist()), weight, scale)
+        scale[agent], error[agent] = state.scale, state.agent_error
+        return cls(tuple(names.tolist()), error, weight, scale)
 
     @classmethod
     def of_sums(
@@ -94,18 +95,17 @@ class AgentWeights:
     ) -> AgentWeights:
         """Weigh agents; only a step that decides rejects or reinstates one."""
         values = found.sums / _UNITS
-        weight = _weigh(
-            values, limits if decides else AgentLimits(limits.tolerance, limits.scale, np.inf, limits.bias_fraction)
-        )
+        error = _estimate_errors(values, limits.bias_fraction)
+        weight = _weigh(error, limits if decides else replace(limits, rejection=np.inf))
         if previous is not None and not decides:
             weight = np.where(previous.weight[previous.rows(found.names)] <= REJECTED_WEIGHT, REJECTED_WEIGHT, weight)
         variance = values[:, _SQUARES] + _PRIOR_VOTES * START_SCALE_M**2
-        return cls(found.names, weight, np.sqrt(variance / (values[:, _VOTES] + _PRIOR_VOTES)))
+        return cls(found.names, error, weight, np.sqrt(variance / (values[:, _VOTES] + _PRIOR_VOTES)))
 
     def restart(self) -> AgentWeights:
         """Return the table at the start of a pass: agents are inliers, or rejected."""
         weight = np.where(self.weight > REJECTED_WEIGHT, 1.0, REJECTED_WEIGHT)
-        return AgentWeights(self.names, weight, np.full(len(weight), START_SCALE_M))
+        return AgentWeights(self.names, np.zeros(len(weight)), weight, np.full(len(weight), START_SCALE_M))
 
     def rows(self, names: Sequence[str]) -> Ints:
         """Return the rows of agents."""
@@ -157,16 +157,20 @@ def apply_agents(state: PoseSolution, table: AgentWeights | None) -> PoseSolutio
         return state
     rows = table.rows(state.agents)
     weight = np.where(state.is_surveyed > 0, 1.0, table.weight[rows])
-    return state.with_agents(weight, table.scale[rows])
+    return state.with_agents(table.error[rows], weight, table.scale[rows])
 
 
-def _weigh(values: Floats, limits: AgentLimits) -> Floats:
-    """Return the weights (A,) that the sums (A, 9) give."""
+def _estimate_errors(values: Floats, bias_fraction: float) -> Floats:
+    """Return the mean correction (A,) of the prior poses of agents in standard deviations, from their sums (A, 9)."""
     weight = values[:, [_XX, _XY, _XY, _YY]].reshape(-1, 2, 2)
     mean = np.linalg.solve(weight + 0.1 * np.eye(2), values[:, [_X, _Y]][:, :, None])[:, :, 0]
-    shared = limits.bias_fraction * (np.trace(weight, axis1=1, axis2=2) / 2 - 1.0).clip(0.0)
+    shared = bias_fraction * (np.trace(weight, axis1=1, axis2=2) / 2 - 1.0).clip(0.0)
     spread = values[:, _VARIANCE] / values[:, _COUNT] * (1.0 + shared)
-    distance = np.sqrt(np.einsum("ai,aij,aj->a", mean, weight, mean).clip(0.0) / np.maximum(spread, 1e-12))
-    beyond = (distance - limits.tolerance).clip(0.0)
+    return np.sqrt(np.einsum("ai,aij,aj->a", mean, weight, mean).clip(0.0) / np.maximum(spread, 1e-12))
+
+
+def _weigh(error: Floats, limits: AgentLimits) -> Floats:
+    """Return the weights (A,) of agents of these errors (A,)."""
+    beyond = (error - limits.tolerance).clip(0.0)
     robust = (limits.scale**2 / (limits.scale**2 + beyond**2)) ** 2
-    return np.where(distance > limits.rejection, REJECTED_WEIGHT, robust)
+    return np.where(error > limits.rejection, REJECTED_WEIGHT, robust)

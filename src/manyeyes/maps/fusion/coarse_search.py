@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from manyeyes._jit import Boolx1, F32x3, F64x1, F64x2, I64x1, njit
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays
@@ -137,6 +138,30 @@ def apply_shifts(arrays: ObservationArrays, home: Ints, shifts: Floats) -> Float
     c, s = np.cos(start[:, 2]), np.sin(start[:, 2])
     x, y = shifts[:, 0], shifts[:, 1]
     return np.stack((start[:, 0] + c * x - s * y, start[:, 1] + s * x + c * y, start[:, 2] + shifts[:, 2]), 1)
+
+
+def find_isolated_shifts(
+    drives: tuple[str, ...], xy: Floats, is_shifted: NDArray[np.bool_], radius_m: float
+) -> NDArray[np.bool_]:
+    """Find the shifted observations (O,) whose drive was shifted at no more than half of its observations nearby.
+
+    The error of a prior pose is mostly common to a drive, so that a shift of one observation among others that fit where they are
+    is taken for a lock on the wrong line.
+
+    Args:
+        drives: (O,) drive of each observation. xy: (O, 2) metres, prior positions. is_shifted: (O,).
+        radius_m: of the drive's observations, those within this distance count, the observation itself included.
+    """
+    if not is_shifted.any():
+        return is_shifted
+    # Drives lie in planes too far apart to count.
+    drive = np.unique(np.array(drives), return_inverse=True)[1]
+    place = np.concatenate((xy, 4.0 * radius_m * drive[:, None]), 1)
+    total, shifted = (
+        cKDTree(place[rows]).query_ball_point(place, radius_m, return_length=True)
+        for rows in (np.arange(len(place)), np.flatnonzero(is_shifted))
+    )
+    return is_shifted & (2 * np.asarray(shifted) <= np.asarray(total))
 
 
 @njit(cache=True, nogil=True)

@@ -53,6 +53,8 @@ class PoseSolverConfig:
     max_observations_per_cell: observations that count per cell of 8 m, class and heading.
     drive_fraction: fraction of the prior variance that is common to a drive. drift_length_m: distance after which the random
         walk of a drive's bias has that variance again. max_drive_gap_m: longer gaps end a drive.
+    drive_support_m: an observation is shifted by the coarse search only where most of its drive within this distance, which is at
+        most domain_halo_m, are.
     domain_m, domain_halo_m: the ground is divided into squares of this side, the origin in the middle of one; the poses in one are
         solved with all that lie within the halo around it, and what lies farther away stays where it is during a step.
     agent_tolerance, agent_scale, max_agent_error: of an agent's mean correction, in standard deviations: up to the first its weight
@@ -86,6 +88,7 @@ class PoseSolverConfig:
     drive_fraction: float = 0.5
     drift_length_m: float = 2400.0
     max_drive_gap_m: float = 300.0
+    drive_support_m: float = 300.0
     domain_m: float = 1536.0
     domain_halo_m: float = 384.0
     agent_tolerance: float = 1.6

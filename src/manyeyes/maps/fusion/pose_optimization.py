@@ -38,7 +38,7 @@ from manyeyes.maps.fusion.agent_weights import (
     apply_agents,
     make_agent_columns,
 )
-from manyeyes.maps.fusion.coarse_search import search_coarse
+from manyeyes.maps.fusion.coarse_search import find_isolated_shifts, search_coarse
 from manyeyes.maps.fusion.joint_solver import (
     JointPriors,
     JointStep,
@@ -204,7 +204,9 @@ def merge_solutions(
     """Merge the home observations of all tiles after a step (None: the first search), ids ascending; solve a joint step."""
     whole = PoseSolution.cat(parts)
     step = None if number is None else config.schedule[number]
-    if step is None or step.joint is None or whole.pairs is None or not len(whole.ids):
+    if step is None or step.joint is None:
+        return _reset_isolated(whole, config)
+    if whole.pairs is None or not len(whole.ids):
         return replace(whole, pairs=None)
     states: list[PoseSolution] = []
     sums: list[AgentSums] = []
@@ -218,6 +220,26 @@ def merge_solutions(
         sums.append(found)
     table = weigh_agents(AgentSums.merge(sums), AgentWeights.of_state(whole), step, config)
     return apply_agents(PoseSolution.cat(states), table)
+
+
+def _reset_isolated(whole: PoseSolution, config: PoseSolverConfig) -> PoseSolution:
+    """Reset the observations that a search shifted alone of their drive to their prior poses."""
+    is_shifted = (whole.initial_pose != whole.prior_pose).any(1)
+    isolated = find_isolated_shifts(whole.drives, whole.prior_pose[:, :2], is_shifted, config.drive_support_m)
+    start = np.where(isolated[:, None], whole.prior_pose, whole.initial_pose)
+    return replace(whole, initial_pose=start, pose=start, pairs=None)
+
+
+def settle_domain(
+    parts: Sequence[PoseSolution], domain: tuple[int, int], config: PoseSolverConfig = DEFAULT_ALIGN
+) -> PoseSolution:
+    """Reset the observations of one domain that a search shifted alone of their drive; ids ascending.
+
+    parts: disjoint, which together hold all observations within the halo of the domain.
+    """
+    whole = PoseSolution.cat(parts)
+    home = np.flatnonzero((_domain_indices(whole.prior_pose, config) == domain).all(1))
+    return _reset_isolated(whole, config).take(home)
 
 
 def list_domains(prior_pose: Floats, config: PoseSolverConfig = DEFAULT_ALIGN) -> list[tuple[int, int]]:

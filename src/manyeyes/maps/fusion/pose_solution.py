@@ -46,7 +46,8 @@ class PoseSolution:
         the marginal covariance adds, which observations nearby share.
     drive_bias: (O, 3) metres, metres, radians, estimated bias of the drive's prior poses here.
     scale: (O,) metres, robust residual scale of the agent's lines.
-    agent_weight: (O,) in (0, 1], see :func:`~manyeyes.maps.fusion.agent_weights.estimate_agent_weights`.
+    agent_error: (O,) mean correction of the agent's prior poses in standard deviations; agent_weight: (O,) in (0, 1] of it, see
+        :mod:`manyeyes.maps.fusion.agent_weights`.
     is_surveyed: (O,) 1 for surveyed poles.
     pairs: sums of a step before its parts are merged, else None.
     """
@@ -63,6 +64,7 @@ class PoseSolution:
     common_covariance: Floats
     drive_bias: Floats
     scale: Floats
+    agent_error: Floats
     agent_weight: Floats
     is_surveyed: Floats
     pairs: PairSums | None = field(default=None, kw_only=True)
@@ -90,9 +92,9 @@ class PoseSolution:
         """Return the chosen rows with their pairs, also those with observations that are left out."""
         return replace(self.take(rows), pairs=None if self.pairs is None else _take_pairs(self.pairs, rows))
 
-    def with_agents(self, agent_weight: Floats, scale: Floats) -> PoseSolution:
-        """Return the same with the weight (O,) and the residual scale (O,) of each observation's agent."""
-        return replace(self, agent_weight=agent_weight, scale=scale)
+    def with_agents(self, agent_error: Floats, agent_weight: Floats, scale: Floats) -> PoseSolution:
+        """Return the same with the error, the weight and the residual scale (O,) of each observation's agent."""
+        return replace(self, agent_error=agent_error, agent_weight=agent_weight, scale=scale)
 
     @classmethod
     def cat(cls, parts: Sequence[PoseSolution]) -> PoseSolution:
@@ -117,6 +119,7 @@ _COLUMNS = (
     "common_covariance",
     "drive_bias",
     "scale",
+    "agent_error",
     "agent_weight",
     "is_surveyed",
 )
@@ -155,6 +158,7 @@ def make_initial_solution(arrays: ObservationArrays) -> PoseSolution:
         common_covariance=np.zeros((count, 3, 3)),
         drive_bias=np.zeros((count, 3)),
         scale=np.full(count, 0.2),
+        agent_error=np.zeros(count),
         agent_weight=np.ones(count),
         is_surveyed=np.asarray(arrays.trusted).astype(np.float64),
     )

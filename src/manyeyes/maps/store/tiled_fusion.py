@@ -37,6 +37,7 @@ from manyeyes.maps.fusion.pose_optimization import (
     list_domains,
     run_step,
     search_coarse_poses,
+    settle_domain,
     solve_domain,
     weigh_agents,
 )
@@ -114,13 +115,12 @@ class FusionJob:
 
 @dataclass(frozen=True)
 class _Plan:
-    """What this process knows of a block: the key of its TileBlock, whether it is home to observations, and the blocks and domains
-    that those it reads are at home in; home_domains: of its own.
+    """What this process knows of a block: the key of its TileBlock, and the domains that the observations it reads are at home in;
+    home_domains: of its own.
     """
 
     place: Place
     members: str
-    blocks: tuple[Place, ...]
     domains: tuple[Place, ...]
     home_domains: tuple[Place, ...]
 
@@ -250,12 +250,10 @@ def _make_plans(job: FusionJob, index: LogIndex, tile_config: TiledFusionConfig)
         (key,) = _put(job.work, folder, {"block": block}, "")
         home = np.isin(np.array(block.observations.ids), np.array(block.home_ids))
         xy, solver = block.observations.xy, job.config.pose_solver
-        blocks = np.unique(tile_indices(xy, tile_config.block_m), axis=0).tolist()
         plans.append(
             _Plan(
                 block.place,
                 key,
-                tuple((x, y) for x, y in blocks),
                 tuple(list_domains(xy, solver)),
                 tuple(list_domains(xy[home], solver)) if home.any() else (),
             )
@@ -280,29 +278,35 @@ class _Run:
         homes = [plan for plan in self.plans if plan.home_domains]
         domains = self._blocks_of_domains(homes)
         task = partial(StepTask, self.job)
-        searched = self._map("search", (task("search", p.place, 0, (p.members,)) for p in homes), len(homes))
-        poses: dict[Place, str] = dict(zip((p.place for p in homes), (keys[0] for keys in searched)))
-        agents, in_domains = "", False
+        total = len(homes) + len(domains)
+
+        def search(name: str, kind: str, number: int, agents: str) -> dict[Place, str]:
+            """Search the poses of all blocks, and settle them domain by domain; the keys by domain."""
+            tasks = (task(kind, p.place, number, (p.members,), agents) for p in homes)
+            found = self._map(name, tasks, total)
+            keys = dict(zip((p.place for p in homes), (keys[0] for keys in found)))
+            tasks = (task("settle", d, number, tuple(keys[b] for b in domains[d])) for d in domains)
+            settled = self._map(name, tasks, total, len(homes))
+            return dict(zip(domains, (keys[0] for keys in settled)))
+
+        agents, poses = "", search("search", "search", 0, "")
 
         def read_by(plan: _Plan) -> tuple[str, ...]:
             """The keys of the block and of the poses that it reads."""
-            return plan.members, *(poses[place] for place in (plan.domains if in_domains else plan.blocks))
+            return plan.members, *(poses[place] for place in plan.domains)
 
         for number, step in enumerate(self.job.config.pose_solver.schedule):
             name = f"step {number + 1}"
             if step.joint is None:
                 ((agents,),) = self._map("", [task("restart", (0, 0), number, (), agents)], 1)
-                tasks = (task("repeat", p.place, number, (p.members,), agents) for p in homes)
-                found = self._map(name, tasks, len(homes))
-                poses, in_domains = dict(zip((p.place for p in homes), (keys[0] for keys in found))), False
+                poses = search(name, "repeat", number, agents)
                 continue
-            total = len(homes) + len(domains)
             tasks = (task("pairs", p.place, number, read_by(p), agents) for p in homes)
             found = self._map(name, tasks, total)
             pairs = dict(zip((p.place for p in homes), (keys[0] for keys in found)))
             tasks = (task("solve", d, number, tuple(pairs[b] for b in domains[d])) for d in domains)
             solved = self._map(name, tasks, total, len(homes))
-            poses, in_domains = dict(zip(domains, (keys[0] for keys in solved))), True
+            poses = dict(zip(domains, (keys[0] for keys in solved)))
             agents = self._weigh(number, [keys[1] for keys in solved], agents)
         tasks = (task("stations", p.place, 0, read_by(p), agents) for p in self.plans)
         return tuple(keys[0] for keys in self._map("stations", tasks, len(self.plans)))
@@ -374,6 +378,9 @@ def _compute(task: StepTask) -> tuple[dict[str, object], tuple[FailedObservation
         if task.kind == "sums":
             return {"sums": sums}, ()
         return {"agents": weigh_agents(sums, table, solver.schedule[task.number], solver)}, ()
+    if task.kind == "settle":
+        parts = [_load(job, key, PoseSolution) for key in task.inputs]
+        return {"poses": settle_domain(parts, task.place, solver)}, ()
     if task.kind == "solve":
         return _compute_solve(task)
     block = _load(job, task.inputs[0], TileBlock)

@@ -10,8 +10,6 @@ from manyeyes.agents.strategies.names import form_of
 from manyeyes.evaluation.attacks.metrics import (
     FIRST_FRAMES,
     EventRate,
-    Proportion,
-    RocCurve,
     Survival,
     count_false_accusations,
     detection_rate,
@@ -24,6 +22,8 @@ from manyeyes.evaluation.attacks.removed_objects import count_removed
 from manyeyes.evaluation.detection.frame_match import FrameMatch
 from manyeyes.evaluation.detection.protocols import DetectionProtocol
 from manyeyes.evaluation.statistics.bootstrap import BootstrapSamples, Interval, bootstrap
+from manyeyes.evaluation.statistics.proportion import Proportion
+from manyeyes.evaluation.statistics.roc import RocCurve
 from manyeyes.studies.attacks.catalog import get_attack
 from manyeyes.studies.attacks.conditions import NO_ATTACK, NO_DEFENCE, ORACLE, AttackCondition
 

@@ -16,9 +16,10 @@ from functools import partial
 from manyeyes.agents.strategies.registry import get_strategy
 from manyeyes.agents.trust.registry import get_misbehaviour_detector
 from manyeyes.datatypes import ConfigError
-from manyeyes.evaluation.attacks.metrics import FIRST_FRAMES, Proportion, Survival
+from manyeyes.evaluation.attacks.metrics import FIRST_FRAMES, Survival
 from manyeyes.evaluation.detection.benchmark import resolve_protocol
 from manyeyes.evaluation.statistics.bootstrap import Interval, exact_interval
+from manyeyes.evaluation.statistics.proportion import Proportion
 from manyeyes.studies.attacks.catalog import ATTACKS, get_attack
 from manyeyes.studies.attacks.conditions import (
     NO_ATTACK,
