@@ -101,7 +101,8 @@ def _attend_blocks(
     room = _KEYS
     for w in range(key_start.shape[0] - 1):
         room = max(room, (key_start[w + 1] - key_start[w] + _KEYS - 1) // _KEYS * _KEYS)
-    rows, key_rows = np.empty(LANES, np.uintp), np.empty(room, np.uintp)
+    # Of LANES queries, and behind them of the keys.
+    rows = np.empty(LANES + room, np.uintp)
     # A row for each key, with a column for each query; a row for each query.
     weights, mixed = np.empty(room * LANES, np.float32), np.empty(LANES * LANES, np.float32)
     sums = np.empty(LANES, np.float32)
@@ -111,17 +112,17 @@ def _attend_blocks(
         for h in range(heads):
             first = np.uintp(h * width)
             for j in range(padded):
-                key_rows[j] = np.uintp(key_order[key_start[w] + min(j, m - 1)] * heads * width) + first
+                rows[LANES + j] = np.uintp(key_order[key_start[w] + min(j, m - 1)] * heads * width) + first
             for begin in range(start[w], start[w + 1], LANES):
                 count = min(start[w + 1] - begin, LANES)
                 for i in range(LANES):
                     rows[i] = np.uintp(order[begin + min(i, count - 1)] * heads * width) + first
                 for c in range(0, width, LANES):
-                    _score(q, rows, c, scale, k, key_rows, padded, weights)
+                    _score(q, k, rows, c, scale, padded, weights)
                 _exponentiate_columns(weights, m, sums)
                 for c in range(0, width, LANES):
                     for i in range(0, LANES, _MIXED):
-                        _mix(weights, m, i, v, key_rows, c, mixed)
+                        _mix(weights, m, i, v, rows, c, mixed)
                     _store(mixed, sums, rows, count, c, out)
 
 
@@ -169,18 +170,16 @@ def _turn(b: Any, rows: list[Any]) -> list[Any]:
     return rows
 
 
-def _make_score(_: Any, q: Any, rows: Any, column: Any, scale: Any, k: Any, key_rows: Any, count: Any, out: Any) -> Any:
-    """out (count, LANES) = products of k[key_rows[j] + c] and q[rows[i] + c] * scale over LANES columns c from column on.
+def _make_score(_: Any, q: Any, k: Any, rows: Any, column: Any, scale: Any, count: Any, out: Any) -> Any:
+    """out (count, LANES) = products of k[rows[LANES + j] + c] and q[rows[i] + c] * scale over LANES columns c from column on.
 
     They are added to out unless column is 0. count: a multiple of _KEYS.
     """
-    kinds = (q, rows, column, scale, k, key_rows, count, out)
+    kinds = (q, k, rows, column, scale, count, out)
 
     def generate(context: Any, b: Any, signature: Any, given: Any) -> Any:
-        q_, rows_, k_, key_rows_, out_ = (
-            context.make_array(kinds[i])(context, b, given[i]).data for i in (0, 1, 4, 5, 7)
-        )
-        column_, scale_, count_ = given[2], given[3], given[6]
+        q_, k_, rows_, out_ = (context.make_array(kinds[i])(context, b, given[i]).data for i in (0, 1, 2, 6))
+        column_, scale_, count_ = given[3:6]
         starts = [b.add(b.load(b.gep(rows_, [_PLACE(i)])), column_) for i in range(LANES)]
         factor = cgutils.alloca_once(b, ir.FloatType())
         b.store(scale_, factor)
@@ -189,7 +188,8 @@ def _make_score(_: Any, q: Any, rows: Any, column: Any, scale: Any, k: Any, key_
         is_first = b.icmp_signed("==", column_, _PLACE(0))
         sums = [cgutils.alloca_once(b, _VECTOR) for _ in range(_KEYS)]
         with cgutils.for_range_slice(b, _PLACE(0), count_, _PLACE(_KEYS), _PLACE) as (at, _):
-            keys = [b.gep(k_, [b.add(b.load(b.gep(key_rows_, [b.add(at, _PLACE(j))])), column_)]) for j in range(_KEYS)]
+            named = (b.load(b.gep(rows_, [b.add(at, _PLACE(LANES + j))])) for j in range(_KEYS))
+            keys = [b.gep(k_, [b.add(row, column_)]) for row in named]
             places = [_vector_at(b, out_, b.mul(b.add(at, _PLACE(j)), _PLACE(LANES))) for j in range(_KEYS)]
             for total, place in zip(sums, places):
                 b.store(b.select(is_first, ir.Constant(_VECTOR, None), b.load(place, align=4)), total)
@@ -200,11 +200,11 @@ def _make_score(_: Any, q: Any, rows: Any, column: Any, scale: Any, k: Any, key_
                 b.store(b.load(total), place, align=4)
         return context.get_dummy_value()
 
-    return types.void(q, rows, types.intp, types.float32, k, key_rows, types.intp, out), generate
+    return types.void(q, k, rows, types.intp, types.float32, types.intp, out), generate
 
 
 def _make_mix(_: Any, weights: Any, count: Any, first: Any, v: Any, rows: Any, column: Any, out: Any) -> Any:
-    """out (LANES, LANES), _MIXED rows from first on = the sums of weights[j, i] * v[rows[j] + column + c] over count keys j."""
+    """out (LANES, LANES), _MIXED rows from first on = the sums of weights[j, i] * v[rows[LANES + j] + column + c] over keys j."""
     kinds = (weights, count, first, v, rows, column, out)
 
     def generate(context: Any, b: Any, signature: Any, given: Any) -> Any:
@@ -214,7 +214,8 @@ def _make_mix(_: Any, weights: Any, count: Any, first: Any, v: Any, rows: Any, c
         for total in sums:
             b.store(ir.Constant(_VECTOR, None), total)
         with cgutils.for_range(b, count_) as loop:
-            value = b.load(_vector_at(b, v_, b.add(b.load(b.gep(rows_, [loop.index])), column_)), align=4)
+            row = b.load(b.gep(rows_, [b.add(loop.index, _PLACE(LANES))]))
+            value = b.load(_vector_at(b, v_, b.add(row, column_)), align=4)
             start = b.gep(weights_, [b.add(b.mul(loop.index, _PLACE(LANES)), first_)])
             for i, total in enumerate(sums):
                 _add_product(b, total, _spread(b, b.gep(start, [_PLACE(i)])), value)
