@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -43,7 +44,7 @@ class BevGrid:
         if self.stride not in (1, 2, 4, 8, 16, 32):
             raise ConfigError(f"BevGrid.stride is one of 1, 2, 4, 8, 16, 32; got {self.stride}.")
 
-    @property
+    @cached_property
     def shape(self) -> tuple[int, int]:
         """(rows along y, columns along x) at this stride."""
         rows, columns = round((self.y_max - self.y_min) / self.pillar), round((self.x_max - self.x_min) / self.pillar)

@@ -61,11 +61,15 @@ class BlockVectors(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BlockWeights:
-    """Weights and biases of query, key, value, output and the feed-forward net's two layers, and of the two norms."""
+    """Weights and biases of query, key, value, output and the feed-forward net's two layers, and of the two norms.
+
+    frequency: (C / 4,) of the encoding of offsets.
+    """
 
     matrices: BlockMatrices
     vectors: BlockVectors
     heads: int
+    frequency: F32x1
 
     @classmethod
     def of(
@@ -84,17 +88,19 @@ class BlockWeights:
         matrices = BlockMatrices(
             *(panels(w.weight.detach().float().T[None], in_bfloat16 and HAS_BFLOAT16) for w in linears)
         )
-        return cls(matrices, BlockVectors(*(t.detach().float().contiguous().numpy() for t in tensors)), heads)
+        channels = linears[0].in_features
+        frequency = (10000.0 ** (-4.0 * np.arange(channels // 4) / channels)).astype(np.float32)
+        vectors = BlockVectors(*(t.detach().float().contiguous().numpy() for t in tensors))
+        return cls(matrices, vectors, heads, frequency)
 
 
 @torch.no_grad()
 def run_block(features: Tensor, offsets: Tensor, runs: WindowRuns, weights: BlockWeights) -> Tensor:
     """features (N, C) float32 of tokens at offsets (N, 2) cells in their windows to (N, C)."""
     x, u = features.contiguous().numpy(), offsets.contiguous().numpy()
-    channels = x.shape[1]
-    frequency = (10000.0 ** (-4.0 * np.arange(channels // 4) / channels)).astype(np.float32)
     order, start = runs.order.numpy(), runs.start.numpy()
-    return torch.from_numpy(_block(x, u, frequency, order, start, weights.heads, weights.matrices, weights.vectors))
+    matrices, vectors = weights.matrices, weights.vectors
+    return torch.from_numpy(_block(x, u, weights.frequency, order, start, weights.heads, matrices, vectors))
 
 
 @njit(cache=True, nogil=True)

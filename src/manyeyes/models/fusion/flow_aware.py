@@ -105,9 +105,7 @@ class PastWeights:
         biased = [linear for linear in linears if linear is not layer.out]
         tensors = [*(w.bias for w in biased), *(t for n in norms for t in (n.weight, n.bias))]
         vectors = PastVectors(*(t.detach().float().contiguous().numpy().copy() for t in tensors))
-        channels = layer.query.in_features
-        frequency = (10000.0 ** (-4.0 * np.arange(channels // 4) / channels)).astype(np.float32)
-        return cls(layer.heads, frequency, block.matrices, vectors)
+        return cls(layer.heads, block.frequency, block.matrices, vectors)
 
     def attend(self, tokens: WindowTokens, past: WindowTokens) -> Tensor:
         """Return the features (N, C) of the tokens after attention to past ones."""
