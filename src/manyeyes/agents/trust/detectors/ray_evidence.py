@@ -307,8 +307,9 @@ class _Detections:
 
     @classmethod
     def of(cls, own: Boxes) -> _Detections:
-        columns = [part.double().numpy() for part in (own.center, own.size, own.yaw[:, None])]
-        return cls(np.concatenate(columns, 1), own.velocity.double().numpy(), own.score.double().numpy())
+        columns = np.empty((len(own), 7))
+        columns[:, :3], columns[:, 3:6], columns[:, 6] = own.center.numpy(), own.size.numpy(), own.yaw.numpy()
+        return cls(columns, own.velocity.double().numpy(), own.score.double().numpy())
 
     def places(self, min_score: float) -> Floats:
         """Return the centres (M, 2) of those of a score."""
