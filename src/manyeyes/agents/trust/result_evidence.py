@@ -13,7 +13,7 @@ from torch import Tensor
 
 from manyeyes.agents.trust._association_kernels import find_supporting_claims
 from manyeyes.agents.trust.association import find_nearest
-from manyeyes.agents.trust.interface import Assessment, Evidence
+from manyeyes.agents.trust.interface import AssessedClaims, Assessment, Evidence
 from manyeyes.datatypes import Boxes
 
 SAME_PLACE_M = 2.0
@@ -49,7 +49,7 @@ def find_result_evidence(boxes: Boxes, own: Boxes, assessment: Assessment | None
         return None
     xy = boxes.center[:, :2].double().contiguous().numpy()
     trust_of = {sender.agent_id: sender.trust for sender in assessment.senders}
-    used = [claims for claims in assessment.claims if assessment.weights.get(claims.agent_id, 0.0) > 0]
+    used = _list_fused_claims(assessment)
     # Of several claims at one place, the one of the highest value decides.
     kinds, trust, is_near = find_supporting_claims(
         xy,
@@ -65,6 +65,18 @@ def find_result_evidence(boxes: Boxes, own: Boxes, assessment: Assessment | None
     kinds[is_own], trust[is_own] = _OWN, 1.0
     senders = _collect_senders([claims.agent_id for claims in used], is_near)
     return ResultEvidence(torch.from_numpy(kinds), senders, torch.from_numpy(trust))
+
+
+def _list_fused_claims(assessment: Assessment) -> list[AssessedClaims]:
+    """List the claims of senders of a positive weight, and the confirmed ones of excluded senders that keep them."""
+    keeps_confirmed = {sender.agent_id for sender in assessment.senders if sender.keeps_confirmed}
+    found = list[AssessedClaims]()
+    for one in assessment.claims or ():
+        if assessment.weights.get(one.agent_id, 0.0) > 0:
+            found.append(one)
+        elif one.agent_id in keeps_confirmed:
+            found.append(AssessedClaims(one.claims[one.is_confirmed], one.kinds[one.is_confirmed]))
+    return found
 
 
 def _collect_senders(agent_ids: Sequence[int], is_near: NDArray[np.bool_]) -> tuple[tuple[int, ...], ...]:
