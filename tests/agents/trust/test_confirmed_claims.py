@@ -41,8 +41,7 @@ def fused(found: Assessment, street: Street, stated: Boxes) -> tuple[Boxes | Non
 
 
 def test_claims_of_a_named_sender_that_the_ego_or_a_third_agent_confirms_are_fused_and_no_others(street):
-    """A false car on seen road says nothing against true claims that others confirm: their loss would cost more than the false
-    car does."""
+    """True claims that others confirm are no less true beside a false one, and their loss would cost more than the false one."""
     claims = {1: MIXED, 2: HONEST}
     found = street.run(5, claims)
     assert sender(found, 1).status is SenderStatus.MALICIOUS and sender(found, 1).weight == 0.0

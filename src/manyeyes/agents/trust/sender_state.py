@@ -29,9 +29,9 @@ MAX_GAP_NS = 1_000_000_000
 class SenderMemory:
     """One sender: its trust at updated_ns; the capture time of its last message; tracks of its claims; objects that it omits.
 
-    reason: of its exclusion; empty if it is not excluded. keeps_confirmed: it was excluded for refuted claims, which say nothing
-    against those that others confirm. contents: of its last messages; copies: which of them were copies, the
-    newest first. contradicted_ns: when its stated pose was last contradicted.
+    reason: of its exclusion; empty if it is not excluded. keeps_confirmed: it was excluded for refuted claims; those that others
+    confirm are still fused. contents: of its last messages; copies: which of them were copies, the newest first. contradicted_ns:
+    when its stated pose was last contradicted.
     """
 
     trust: BetaTrust
