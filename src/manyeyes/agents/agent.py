@@ -402,7 +402,7 @@ class Agent:
         """Return the boxes with bounded scores where no agent proposes an object; senders of several such are recorded."""
         if self.misbehaviour is None or self._assessment is None or self._assessment.claims is None:
             return boxes
-        orphans = find_orphans(frame, boxes, self.perception_cache, messages)
+        orphans = find_orphans(frame, boxes, self.perception_cache, messages, self._assessment)
         if orphans is None:
             return boxes
         state = self.misbehaviour.record_orphans(self._assessment.state, orphans.senders)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -84,7 +85,7 @@ def test_the_agreement_is_that_of_all_pairs():
         distance = np.linalg.norm(seen[None] - claims[:, None] - shift, axis=2)
         expected = (1 - (distance.min(1).clip(max=12.0) / 12.0) ** 2).sum()
         first, offsets = list_pairs(claims, seen, 100.0)
-        score, number, _ = score_shift(first, offsets, np.zeros((15, 2)), *shift, 12.0)
+        score, number, _ = score_shift(first, offsets, np.zeros((15, 2)), shift[0], shift[1], 12.0)
         assert score == pytest.approx(expected) and number == (distance.min(1) < 12.0).sum() > 0
 
 
@@ -136,3 +137,26 @@ def test_a_sender_that_copies_again_and_again_is_named_and_its_source_is_not():
     assert weights[0] == 1.0 and weights[1:] == [0.0] * 4
     assert [sender(one, 2).status is SenderStatus.MALICIOUS for one in found] == [False, False, False, True, True]
     assert all(sender(one, 1).weight == 1.0 and sender(one, 1).status is SenderStatus.NORMAL for one in found)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_search_that_skips_shifts_with_few_pairs_finds_what_trying_all_of_them_finds(seed):
+    rng, seen = np.random.default_rng(seed), scattered(seed, 25)
+    size = rng.integers(6, 16)
+    claims = np.concatenate(
+        (seen[:size] + rng.normal(0.0, 0.3, (size, 2)) + rng.uniform(-3.0, 3.0, 2), scattered(99, 6))
+    )
+    found = find_offset(claims, seen, HERE, CONFIG)
+    first, offsets = list_pairs(claims, seen, CONFIG.search_m)
+    near, far = score_shift(first, offsets, np.zeros_like(claims), 0.0, 0.0, CONFIG.tolerance_m)[0], 0.0
+    for degrees in np.arange(-4, 5) * CONFIG.turn_step_deg:
+        moved = turned(claims, degrees) - claims
+        for row, (begin, end) in enumerate(pairwise(first)):
+            for shift in offsets[begin:end] - moved[row]:
+                score, _, metres = score_shift(first, offsets, moved, shift[0], shift[1], CONFIG.tolerance_m)
+                near, far = (max(near, score), far) if metres <= CONFIG.max_offset_m else (near, max(far, score))
+    # The search ends early where no offset is possible; elsewhere both agreements are those of all shifts.
+    is_early = found.displaced == 0.0
+    assert is_early or (found.consistent, found.displaced) == (pytest.approx(near), pytest.approx(far))
+    is_wrong = far > CONFIG.ratio * near + CONFIG.margin
+    assert found.contradicts(CONFIG) is True if is_wrong else found.contradicts(CONFIG) is not True

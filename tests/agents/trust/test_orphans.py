@@ -7,12 +7,15 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
 
+import numpy as np
 import pytest
 import torch
 
 from manyeyes.agents.fusion_selection import MIN_SHARE, select_for_fusion
 from manyeyes.agents.perception_cache import BoxOutput, PerceptionCache
+from manyeyes.agents.trust.claims import Claims
 from manyeyes.agents.trust.detectors.ray_evidence import RayEvidenceDetector
+from manyeyes.agents.trust.interface import AssessedClaims, Assessment, Evidence, SenderAssessment
 from manyeyes.agents.trust.orphans import MAX_SCORE, Orphans, bound_orphans, find_orphans
 from manyeyes.agents.trust.sender_state import TrustState
 from manyeyes.comms.inbox import ReceivedMessage
@@ -90,6 +93,14 @@ def test_proposals_own_detections_low_scores_and_clouds_make_no_orphans():
 def test_sent_objects_are_proposals():
     sent = replace(message(1, dict.fromkeys(ORPHANS, -6.0)), tokens=None, objects=cars(*ORPHANS))
     assert find_orphans(FRAME, cars(*ORPHANS), cache(), [sent]) is None
+
+
+def test_a_claim_of_a_sender_of_full_weight_is_a_proposal_and_a_refuted_one_or_one_of_less_weight_is_none():
+    claims = Claims.of(1, cars(*ORPHANS), np.full(3, 0.1))
+    for weight, kind, is_none in ((1.0, Evidence.UNCHECKED, True), (0.9, 0, False), (1.0, Evidence.REFUTED, False)):
+        assessed = AssessedClaims(claims, np.full(3, kind, np.uint8))
+        assessment = Assessment((SenderAssessment(1, 0.7, weight),), (assessed,))
+        assert (find_orphans(FRAME, cars(*ORPHANS), cache(), [], assessment) is None) is is_none
 
 
 def test_orphans_lower_the_trust_in_their_sender_by_a_fault():

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Returns through glass and in rain, on clouds drawn by hand."""
 
+import numpy as np
 import pytest
 import torch
 
 from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, Snapshot, Transform
+from manyeyes.studies.attacks._weather_kernels import find_window_returns
 from manyeyes.studies.attacks.weather import GlassReturns, RainReturns, make_weather
 
 CAR = Boxes.of([[10.0, 0.0, 1.0]], [[4.0, 2.0, 2.0]], [0.0]).to(torch.float64)
@@ -29,6 +31,19 @@ def test_glass_changes_returns_of_windows_alone() -> None:
     before, after = frame.points.xyz[0] - sensor, behind[0] - sensor
     assert float(after.norm() - before.norm()) == pytest.approx(7.5, abs=1e-4)
     assert torch.allclose(before / before.norm(), after / after.norm(), atol=1e-6)
+
+
+def test_returns_of_windows_are_those_that_vehicles_contain_in_a_band_of_their_height() -> None:
+    rng = np.random.default_rng(4)
+    points = torch.from_numpy(rng.uniform((-20, -20, -0.5), (20, 20, 3), (30_000, 3))).float()
+    boxes = Boxes.of(
+        rng.uniform((-15, -15, 0.5), (15, 15, 1.2), (12, 3)), rng.uniform(1, 5, (12, 3)), rng.uniform(-3, 3, 12)
+    )
+    columns = torch.cat((boxes.center, boxes.size, boxes.yaw[:, None]), 1)
+    found = find_window_returns(points.numpy(), columns.numpy(), 0.55, 0.9, 0.1)
+    share = (points[None, :, 2] - (boxes.center[:, 2:] - boxes.size[:, 2:] / 2)) / boxes.size[:, 2:]
+    expected = (boxes.contains(points.double(), 0.1) & (share >= 0.55) & (share <= 0.9)).any(0)
+    assert 100 < expected.sum() < 15_000 and np.array_equal(found, expected.numpy())
 
 
 def test_rain_loses_far_returns_first_and_adds_near_drops() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, njit
+from manyeyes._jit import Boolx1, Boolx2, F64x1, F64x2, I64x1, U8x1, njit
 
 
 @njit(cache=True, nogil=True)
@@ -74,3 +74,57 @@ def match_claims(
                 continue
             is_corroborated[begin:end] |= find_partners(xy[begin:end], third, gate_m[begin:end]) >= 0
     return is_own, is_corroborated
+
+
+@njit(cache=True, nogil=True)
+def count_equal(
+    xy: F64x2, places: F64x2, sizes: I64x1, agents: I64x1, agent_id: int, equal_m: float
+) -> I64x1:  # pragma: no cover
+    """Return (C,) how many of the positions (N, 2) of an agent are nearest to one of each content of other agents, within equal_m.
+
+    places (M, 2): of all contents, one after the other, of sizes (C,) and agents (C,).
+    """
+    equal = np.zeros(len(sizes), np.int64)
+    for i in range(len(xy)):
+        best, row, begin = equal_m * equal_m, -1, 0
+        for content in range(len(sizes)):
+            end = begin + sizes[content]
+            if agents[content] != agent_id:
+                for j in range(begin, end):
+                    dx = xy[i, 0] - places[j, 0]
+                    if abs(dx) > equal_m:
+                        continue
+                    dy = xy[i, 1] - places[j, 1]
+                    squared = dx * dx + dy * dy
+                    if squared <= best and (row < 0 or squared < best):
+                        best, row = squared, content
+            begin = end
+        if row >= 0:
+            equal[row] += 1
+    return equal
+
+
+@njit(cache=True, nogil=True)
+def find_supporting_claims(
+    xy: F64x2, places: F64x2, kinds: U8x1, first: I64x1, trust: F64x1, refuted: int, radius_m: float
+) -> tuple[U8x1, F64x1, Boolx2]:  # pragma: no cover
+    """Return for positions (N, 2) the highest evidence (N,) of the nearest claims of all senders within a radius, the highest trust
+    (N,) in these senders, 0 without any, and which senders claim it (S, N).
+
+    places (M, 2), kinds (M,): of the claims of all senders, one after the other; first: (S + 1,) of each sender. trust: (S,).
+    refuted: the kind of claims that support nothing.
+    """
+    found, highest = np.zeros(len(xy), np.uint8), np.zeros(len(xy))
+    is_near = np.zeros((len(trust), len(xy)), np.bool_)
+    for s in range(len(trust)):
+        for i in range(len(xy)):
+            best, row = radius_m * radius_m, -1
+            for j in range(first[s], first[s + 1]):
+                dx, dy = xy[i, 0] - places[j, 0], xy[i, 1] - places[j, 1]
+                squared = dx * dx + dy * dy
+                if squared <= best and kinds[j] != refuted and (row < 0 or squared < best):
+                    best, row = squared, j
+            if row >= 0:
+                is_near[s, i] = True
+                found[i], highest[i] = max(found[i], kinds[row]), max(highest[i], trust[s])
+    return found, highest, is_near

@@ -7,10 +7,14 @@ import math
 
 import numpy as np
 
-from manyeyes._jit import F64x1, F64x2, I64x1, njit
+from manyeyes._jit import F64x1, F64x2, I64x1, I64x2, njit
 
 NEAR_M, MIN_UNMOVED = 3.5, 0.5
 """There is no offset where the agreement without one is one more than MIN_UNMOVED of the claims within NEAR_M of a detection."""
+
+
+NUM_CELLS = 64
+"""Rows and columns of the grid of offsets; a power of two."""
 
 
 @njit(cache=True, nogil=True)
@@ -50,18 +54,41 @@ def score_shift(
 
 
 @njit(cache=True, nogil=True)
+def _add_to_cells(
+    cells: I64x2, first: I64x1, offsets: F64x2, turned: F64x2, cell_m: float, number: int
+) -> None:  # pragma: no cover
+    """Add a number to the cell of each pair's offset after a turn; the grid repeats itself."""
+    for i in range(len(turned)):
+        for k in range(first[i], first[i + 1]):
+            row = math.floor((offsets[k, 0] - turned[i, 0]) / cell_m) % NUM_CELLS
+            column = math.floor((offsets[k, 1] - turned[i, 1]) / cell_m) % NUM_CELLS
+            cells[row, column] += number
+
+
+@njit(cache=True, nogil=True)
+def _count_cells(cells: I64x2, x: float, y: float, cell_m: float) -> int:  # pragma: no cover
+    """Return the number of pairs in the cell of an offset and in those around it: at least all within cell_m of it."""
+    row, column, number = math.floor(x / cell_m), math.floor(y / cell_m), 0
+    for a in range(-1, 2):
+        for b in range(-1, 2):
+            number += cells[(row + a) % NUM_CELLS, (column + b) % NUM_CELLS]
+    return number
+
+
+@njit(cache=True, nogil=True)
 def search_offset(
     claims: F64x2, detections: F64x2, pivot: F64x1, turns: F64x1, limits: F64x1
 ) -> tuple[float, float, int, float]:  # pragma: no cover
-    """Try every shift of one claim onto one detection after every turn about the pivot.
+    """Try every shift of one claim onto one detection after every turn about the pivot, but those with too few pairs nearby to
+    agree better than the best consistent pose.
 
     limits: search_m, tolerance_m, max_offset_m, ratio, margin of ``OffsetConfig``. Returns the best agreement of displacements up
-    to max_offset_m, the best of larger ones, and the number of pairs and the displacement of the latter.
+    to max_offset_m, the best of larger ones where it exceeds that (0 otherwise), and the number of pairs and the displacement of
+    the latter.
     """
     search_m, tolerance_m, max_offset_m, ratio, margin = limits
     first, offsets = list_pairs(claims, detections, search_m)
     turned = np.zeros_like(claims)
-    near, _, _ = score_shift(first, offsets, turned, 0.0, 0.0, tolerance_m)
     far, far_pairs, far_m, num_reachable, num_near = 0.0, 0, 0.0, 0, 0
     for i in range(len(claims)):
         num_reachable += first[i + 1] > first[i]
@@ -69,21 +96,29 @@ def search_offset(
             if offsets[k, 0] * offsets[k, 0] + offsets[k, 1] * offsets[k, 1] <= NEAR_M * NEAR_M:
                 num_near += 1
                 break
+    near, _, _ = score_shift(first, offsets, turned, 0.0, 0.0, tolerance_m)
     # No offset can do better than all claims that have a detection within reach; and where most of those near a detection are at
     # their place, there is no offset.
     if near * ratio + margin >= num_reachable or near >= MIN_UNMOVED * num_near + 1.0:
         return near, far, far_pairs, far_m
+    cells = np.zeros((NUM_CELLS, NUM_CELLS), np.int64)
     for turn in turns:
         cosine, sine = math.cos(turn) - 1.0, math.sin(turn)
         for i in range(len(claims)):
             dx, dy = claims[i, 0] - pivot[0], claims[i, 1] - pivot[1]
             turned[i, 0], turned[i, 1] = dx * cosine - dy * sine, dx * sine + dy * cosine
+        _add_to_cells(cells, first, offsets, turned, tolerance_m, 1)
         for i in range(len(claims)):
             for k in range(first[i], first[i + 1]):
                 shift_x, shift_y = offsets[k, 0] - turned[i, 0], offsets[k, 1] - turned[i, 1]
+                if _count_cells(cells, shift_x, shift_y, tolerance_m) <= near:
+                    continue
                 score, pairs, moved = score_shift(first, offsets, turned, shift_x, shift_y, tolerance_m)
+                if score <= near:
+                    continue
                 if moved <= max_offset_m:
                     near = max(near, score)
                 elif score > far:
                     far, far_pairs, far_m = score, pairs, moved
+        _add_to_cells(cells, first, offsets, turned, tolerance_m, -1)
     return near, far, far_pairs, far_m

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import I64x2
 from manyeyes.agents.trust._association_kernels import match_claims
-from manyeyes.agents.trust.association import Floats, Rows
+from manyeyes.agents.trust.association import Floats
 from manyeyes.agents.trust.claims import Claims
 from manyeyes.agents.trust.interface import Evidence
 from manyeyes.datatypes import AgentFrame
@@ -80,19 +79,15 @@ def check_claims(
         probes: (P, 7) further boxes, centre, size and yaw, whose rays are counted, without margin.
     """
     sizes = np.cumsum([0, *map(len, claims)])
-    xy = np.concatenate([np.zeros((0, 2)), *(one.xy for one in claims)])
-    gates = config.gate_m + 2 * np.concatenate([np.zeros(0), *(one.sigma_m for one in claims)])
+    columns = np.concatenate([np.zeros((0, 7)), *(one.columns for one in claims)])
+    sigma_m, xy = np.concatenate([np.zeros(0), *(one.sigma_m for one in claims)]), columns[:, :2].copy()
     is_trusted = np.array([trust.get(one.agent_id, 0.0) >= config.min_corroborating_trust for one in claims], np.bool_)
-    places = np.ascontiguousarray(own)
+    gates, places = config.gate_m + 2 * sigma_m, np.ascontiguousarray(own)
     is_own, is_third = match_claims(xy, gates, sizes, places, is_trusted, config.copy_m, config.max_copied)
-    supported = is_own * np.uint8(_SUPPORTED)
-    kinds = [supported[begin:end] for begin, end in pairwise(sizes)]
-    rays = _check_rays(frame, claims, kinds, config, probes)
-    checked = list[CheckedClaims]()
-    for one, kind, begin in zip(claims, kinds, sizes):
-        corroborated = is_third[begin : begin + len(one)]
-        kind[corroborated & (kind == _UNCHECKED)] = _CORROBORATED
-        checked.append(CheckedClaims(one, kind, corroborated))
+    kinds = is_own * np.uint8(_SUPPORTED)
+    rays = _check_rays(frame, columns, sigma_m, kinds, config, probes)
+    kinds[is_third & (kinds == _UNCHECKED)] = _CORROBORATED
+    checked = (CheckedClaims(one, kinds[a:b], is_third[a:b]) for one, a, b in zip(claims, sizes, sizes[1:]))
     return tuple(checked), rays
 
 
@@ -105,21 +100,18 @@ def classify_rays(rays: I64x2, config: EvidenceConfig) -> Kinds:
 
 
 def _check_rays(
-    frame: AgentFrame, claims: Sequence[Claims], kinds: Sequence[Kinds], config: EvidenceConfig, probes: Floats
+    frame: AgentFrame, columns: Floats, sigma_m: Floats, kinds: Kinds, config: EvidenceConfig, probes: Floats
 ) -> I64x2:
-    """Set the evidence on the unmatched claims of all senders, in place; return the rays of the probes."""
-    rows, boxes, margins = list[Rows](), [probes], [np.zeros(len(probes))]
-    for one, kind in zip(claims, kinds):
-        margin = config.margin_m + one.sigma_m.clip(config.min_sigma_m)
-        is_near = np.hypot(*one.xy.T) <= config.max_range_m
-        rows.append(np.flatnonzero((kind == _UNCHECKED) & is_near & (margin <= config.max_margin_m)))
-        boxes.append(one.columns[rows[-1]])
-        margins.append(margin[rows[-1]])
-    rays = count_rays_of_columns(
-        frame.points.xyz.numpy(), frame.sensor_height_m, np.concatenate(boxes), np.concatenate(margins)
-    )
-    found, at = classify_rays(rays, config), len(probes)
-    for tested, kind in zip(rows, kinds):
-        kind[tested] = found[at : at + len(tested)]
-        at += len(tested)
-    return rays[: len(probes)]
+    """Set the evidence on the unmatched claims of all senders, in place; return the rays of the probes.
+
+    columns (N, 7), sigma_m (N,), kinds (N,): of all claims.
+    """
+    margin = config.margin_m + np.maximum(sigma_m, config.min_sigma_m)
+    is_near = np.hypot(columns[:, 0], columns[:, 1]) <= config.max_range_m
+    tested = np.flatnonzero((kinds == _UNCHECKED) & is_near & (margin <= config.max_margin_m))
+    boxes, margins = columns[tested], margin[tested]
+    if len(probes):
+        boxes, margins = np.concatenate((boxes, probes)), np.concatenate((margins, np.zeros(len(probes))))
+    rays = count_rays_of_columns(frame.points.xyz.numpy(), frame.sensor_height_m, boxes, margins)
+    kinds[tested] = classify_rays(rays[: len(tested)], config)
+    return rays[len(tested) :]

@@ -7,6 +7,7 @@ Single claims that are displaced by less than the gate of a match still count as
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -38,8 +39,8 @@ class OffsetConfig:
 
 @dataclass(frozen=True)
 class ClaimOffset:
-    """Agreement of claims with detections, in claims: the best of a consistent pose, and the best of a larger displacement, with
-    its number of claims and their mean displacement, metres.
+    """Agreement of claims with detections, in claims: the best of a consistent pose, and that of a larger displacement that agrees
+    better, 0 without one, with its number of claims and their mean displacement, metres.
     """
 
     consistent: float
@@ -58,9 +59,16 @@ def find_offset(claims: Floats, detections: Floats, sender: tuple[float, float],
     """Return the offset of claims (N, 2) of a sender at a place against detections (K, 2) of the ego, all in one frame, metres."""
     if min(len(claims), len(detections)) < config.min_pairs:
         return ClaimOffset(0.0, 0.0, 0, 0.0)
-    num_steps = round(config.max_turn_deg / config.turn_step_deg)
-    turns = np.radians(config.turn_step_deg) * np.arange(-num_steps, num_steps + 1)
-    limits = np.array([config.search_m, config.tolerance_m, config.max_offset_m, config.ratio, config.margin])
+    turns, limits = _make_arguments(config)
     xy, places = np.ascontiguousarray(claims), np.ascontiguousarray(detections)
     found = search_offset(xy, places, np.array(sender), turns, limits)
     return ClaimOffset(float(found[0]), float(found[1]), int(found[2]), float(found[3]))
+
+
+@lru_cache(maxsize=8)
+def _make_arguments(config: OffsetConfig) -> tuple[Floats, Floats]:
+    """Return the turns, radians, and the limits of ``search_offset``."""
+    num_steps = round(config.max_turn_deg / config.turn_step_deg)
+    turns = np.radians(config.turn_step_deg) * np.arange(-num_steps, num_steps + 1)
+    limits = np.array([config.search_m, config.tolerance_m, config.max_offset_m, config.ratio, config.margin])
+    return turns, limits

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.agents.strategies.message_header import age_s
 from manyeyes.agents.trust._claim_kernels import place_claims, place_proposals
 from manyeyes.agents.trust.association import Floats
-from manyeyes.datatypes import AgentFrame, Boxes, Message, Transform
+from manyeyes.datatypes import AgentFrame, Boxes, Message
 from manyeyes.models.detector.box_head import DecodeConfig, make_decode_arguments
 from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.detector.protocols import has_tokens
@@ -76,15 +77,23 @@ class Claims:
 def extract_claims(frame: AgentFrame, cache: PerceptionCache, messages: Sequence[Message]) -> tuple[Claims, ...]:
     """Return the claims of each message of MIN_SCORE. Clouds claim nothing: a detector would have to run on each."""
     detector = cache.detector
-    config = replace(detector.decode_config, score_threshold=MIN_SCORE) if has_tokens(detector) else None
-    ego_from_world = frame.world_from_agent.inverse()
-    return tuple(_extract(frame, ego_from_world, config, message) for message in messages)
+    config = _lower_threshold(detector.decode_config) if has_tokens(detector) else None
+    return tuple(_extract(frame, config, message) for message in messages)
 
 
-def _extract(frame: AgentFrame, ego_from_world: Transform, config: DecodeConfig | None, message: Message) -> Claims:
-    ego_from_other, seconds = ego_from_world @ message.world_from_agent, age_s(frame, message)
-    rotation, origin = ego_from_other.rotation.numpy(), ego_from_other.translation.numpy()
-    x, y, yaw = np.diagonal((frame.pose_covariance + message.pose_covariance).double().numpy()).clip(0).tolist()
+@lru_cache(maxsize=8)
+def _lower_threshold(config: DecodeConfig) -> DecodeConfig:
+    """Return the configuration with a threshold of MIN_SCORE."""
+    return replace(config, score_threshold=MIN_SCORE)
+
+
+def _extract(frame: AgentFrame, config: DecodeConfig | None, message: Message) -> Claims:
+    here, there, seconds = frame.world_from_agent, message.world_from_agent, age_s(frame, message)
+    from_world = here.rotation.numpy().T
+    rotation = np.ascontiguousarray(from_world @ there.rotation.numpy())
+    origin = from_world @ (there.translation.numpy() - here.translation.numpy())
+    covariance = frame.pose_covariance.numpy() + message.pose_covariance.numpy()
+    x, y, yaw = (max(float(covariance[k, k]), 0.0) for k in range(3))
     variances = (x + y) / 2 + (SIGMA_VELOCITY_MPS * seconds) ** 2, yaw
     numbers, tokens = np.array([seconds, *variances, MIN_SCORE]), message.tokens
     if message.objects is None and tokens is not None and config and tokens.features.shape[1] >= PROPOSAL_DIM:

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from manyeyes.agents.trust.association import Floats, find_nearest
+from manyeyes.agents.trust._association_kernels import count_equal
+from manyeyes.agents.trust.association import Floats
 from manyeyes.agents.trust.claims import Claims
 
 NUM_KEPT = 4
@@ -54,15 +55,12 @@ def find_copies(
     if not contents:
         return {}
     places, sizes = np.concatenate([xy for _, xy in contents]), np.array([len(xy) for _, xy in contents])
-    agents, row_of_place = np.array([agent_id for agent_id, _ in contents]), np.repeat(np.arange(len(sizes)), sizes)
-    found = dict[int, int]()
+    agents, found = np.array([agent_id for agent_id, _ in contents]), dict[int, int]()
     for one, time_ns in zip(claims, times_ns):
         xy = one.stated_xy
         if xy is None or len(xy) < config.min_equal or is_known(earlier.get(one.agent_id, ()), time_ns):
             continue
-        is_other = agents[row_of_place] != one.agent_id
-        nearest = find_nearest(xy, places[is_other], config.equal_m)
-        equal = np.bincount(row_of_place[is_other][nearest[nearest >= 0]], minlength=len(sizes))
+        equal = count_equal(xy, places, sizes, agents, one.agent_id, config.equal_m)
         is_copied = (equal >= config.min_equal) & (equal > config.max_copied * np.minimum(len(xy), sizes))
         if is_copied.any():
             found[one.agent_id] = int(agents[int(np.argmax(is_copied))])

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -26,7 +26,10 @@ MIN_LOG_WEIGHT = -4.0
 def weigh_received(
     frame: AgentFrame, received: Sequence[ReceivedMessage], assessment: Assessment
 ) -> tuple[tuple[ReceivedMessage, ...], tuple[Rejection, ...]]:
-    """Return the weighted messages of senders of a positive weight, and the rejection of the others."""
+    """Return the weighted messages of senders of a positive weight, and the rejection of the others.
+
+    Of an excluded sender whose confirmed claims are kept, the part near them is returned, beside the rejection.
+    """
     claims = {assessed.agent_id: assessed for assessed in assessment.claims or ()}
     kept, rejected = list[ReceivedMessage](), list[Rejection]()
     senders = {sender.agent_id: sender for sender in assessment.senders}
@@ -38,6 +41,12 @@ def weigh_received(
             kept.append(replace(reception, message=message))
         else:
             text = f"{sender.status.value}, trust {sender.trust:.2f}: {sender.reason}"
+            message = None
+            if sender.keeps_confirmed and agent_id in claims:
+                message = keep_confirmed(frame, reception.message, claims[agent_id])
+            if message is not None:
+                kept.append(replace(reception, message=message))
+                text += "; only what is near its confirmed claims is fused"
             rejected.append(Rejection(agent_id, "untrusted", text))
     return tuple(kept), tuple(rejected)
 
@@ -63,17 +72,33 @@ def weigh_message(frame: AgentFrame, message: Message, weight: float, claims: As
     return replace(message, objects=objects, tokens=tokens)
 
 
+def keep_confirmed(frame: AgentFrame, message: Message, claims: AssessedClaims) -> Message | None:
+    """Return what a message states near its confirmed claims and near none that is refuted or disputed; None if it is nothing."""
+    confirmed = torch.from_numpy(claims.claims.xy[claims.is_confirmed])
+    is_denied = (claims.kinds == Evidence.REFUTED) | (claims.kinds == Evidence.DISPUTED)
+    denied = torch.from_numpy(claims.claims.xy[is_denied])
+    bare = replace(message, points=None, local_map=None, request=None)
+    kept = _keep(frame, bare, lambda xy: ~_is_far(xy, confirmed) & _is_far(xy, denied))
+    num_kept = sum(len(part) for part in (kept.objects, None if kept.tokens is None else kept.tokens.sites) if part)
+    return kept if num_kept else None
+
+
 def _remove_near(frame: AgentFrame, message: Message, places: Tensor) -> Message:
     """Return a message without objects and tokens near places (K, 2) in the ego's frame at its time."""
+    return _keep(frame, message, lambda xy: _is_far(xy, places))
+
+
+def _keep(frame: AgentFrame, message: Message, choose: Callable[[Tensor], Tensor]) -> Message:
+    """Return a message with some of its objects and tokens; choose: (N,) bool by places (N, 2) in the ego's frame at its time."""
     seconds, ego_from_other = age_s(frame, message), ego_from_sender(frame, message)
     objects, tokens, score = message.objects, message.tokens, message.token_score
     descriptors = message.descriptors
     if objects is not None:
-        is_kept = _is_far(object_places(objects, seconds, ego_from_other), places)
+        is_kept = choose(object_places(objects, seconds, ego_from_other))
         descriptors = None if descriptors is None else descriptors[is_kept]
         objects = objects[is_kept]
     if tokens is not None:
-        is_kept = _is_far(token_places(tokens, seconds, ego_from_other), places)
+        is_kept = choose(token_places(tokens, seconds, ego_from_other))
         tokens, score = tokens.keep(is_kept), None if score is None else score[is_kept]
     return replace(message, objects=objects, tokens=tokens, token_score=score, descriptors=descriptors)
 

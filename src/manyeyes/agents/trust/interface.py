@@ -34,6 +34,10 @@ class Evidence(IntEnum):
     OWN = 5
 
 
+# Members of an enumeration are slow to read.
+_SUPPORTED, _CORROBORATED = int(Evidence.SUPPORTED), int(Evidence.CORROBORATED)
+
+
 class SenderStatus(Enum):
     """NORMAL; MALICIOUS: named, for the whole term of its exclusion; FAULTY: its poses are off, which is no attack."""
 
@@ -45,7 +49,8 @@ class SenderStatus(Enum):
 @dataclass(frozen=True)
 class SenderAssessment:
     """Assessment of one sender. trust: in [0, 1]. weight: of its content in fusion, in [0, 1]; 0 excludes it. reason: of a
-    status that is not normal, or of an exclusion.
+    status that is not normal, or of an exclusion. keeps_confirmed: of an excluded sender, what it states at claims that the ego or
+    a trusted third agent confirms is fused nevertheless.
     """
 
     agent_id: int
@@ -53,6 +58,7 @@ class SenderAssessment:
     weight: float = 1.0
     status: SenderStatus = SenderStatus.NORMAL
     reason: str = ""
+    keeps_confirmed: bool = False
 
 
 @dataclass(frozen=True)
@@ -71,6 +77,11 @@ class AssessedClaims:
     def boxes(self) -> Boxes:
         """The claimed boxes (N)."""
         return self.claims.boxes
+
+    @property
+    def is_confirmed(self) -> NDArray[np.bool_]:
+        """Which claims (N,) the ego or a trusted third agent confirms."""
+        return (self.kinds == _SUPPORTED) | (self.kinds == _CORROBORATED)
 
     @property
     def evidence(self) -> Tensor:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from manyeyes._jit import I64x2
-from manyeyes.agents.trust.association import Floats, Rows, associate
+from manyeyes.agents.trust.association import Floats, Rows, associate, find_nearest
 from manyeyes.agents.trust.claims import Claims
 
 PROBE_SIZE_M = (1.0, 1.0, 1.8)
@@ -59,7 +59,9 @@ class OwnObjects:
 
     def follow(self, now: OwnObjects, rotation: Floats, shift: Floats, seconds: float) -> OwnObjects:
         """Return the objects of now with their number of frames; rotation (2, 2), shift (2,): motion of the ego since."""
-        if not len(self) or not len(now):
+        if not len(now):
+            return now
+        if not len(self):
             return OwnObjects(now.columns, now.velocity, np.ones(len(now), np.int64))
         expected = (self.columns[:, :2] + self.velocity * seconds) @ rotation.T + shift
         partner = associate(now.columns[:, :2], expected, 2.0)
@@ -67,16 +69,18 @@ class OwnObjects:
         return OwnObjects(now.columns, now.velocity, earlier + 1)
 
 
+_NO_OBJECTS = OwnObjects.empty()
+
+
 def find_unclaimed(objects: OwnObjects, claims: Claims, config: OmissionConfig) -> OwnObjects:
     """Return the objects that a sender nearby does not claim; none if its list may be incomplete."""
     if not claims.is_complete or not len(objects) or abs(claims.age_s) > config.max_age_s:
-        return OwnObjects.empty()
+        return _NO_OBJECTS
     xy = objects.columns[:, :2]
-    distance = np.hypot(*(xy - claims.sender_xy).T)
+    distance = np.hypot(xy[:, 0] - claims.sender_xy[0], xy[:, 1] - claims.sender_xy[1])
     is_near = (distance <= config.max_distance_m) & (distance > 2 * END_M) & (objects.num_frames >= config.min_frames)
     gate = max(SAME_OBJECT_M, 2 * float(claims.sigma_m.max())) if len(claims) else SAME_OBJECT_M
-    to_claims = np.hypot(xy[:, None, 0] - claims.xy[None, :, 0], xy[:, None, 1] - claims.xy[None, :, 1])
-    return objects[np.flatnonzero(is_near & (to_claims.min(1, initial=np.inf) > gate))]
+    return objects[np.flatnonzero(is_near & (find_nearest(xy, claims.xy, gate) < 0))]
 
 
 def make_probes(unclaimed: OwnObjects, sender_xy: tuple[float, float], config: OmissionConfig) -> Floats:

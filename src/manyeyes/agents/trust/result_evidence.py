@@ -11,14 +11,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from manyeyes.agents.trust._association_kernels import find_supporting_claims
 from manyeyes.agents.trust.association import find_nearest
-from manyeyes.agents.trust.interface import Assessment, Evidence
+from manyeyes.agents.trust.interface import AssessedClaims, Assessment, Evidence
 from manyeyes.datatypes import Boxes
 
 SAME_PLACE_M = 2.0
 """A result rests on the claims whose centres are closer."""
 OWN_PLACE_M, MIN_OWN_SCORE = 1.0, 0.3
 """A result within OWN_PLACE_M of an own detection of MIN_OWN_SCORE is the ego's own."""
+# Members of an enumeration are slow to read.
+_OWN, _REFUTED = int(Evidence.OWN), int(Evidence.REFUTED)
+_UNCHECKED, _DISPUTED = int(Evidence.UNCHECKED), int(Evidence.DISPUTED)
 MIN_TRUST, MAX_UNCHECKED_SCORE = 0.8, 0.49
 """Maximum score of a result that is unchecked and rests on one sender of less than MIN_TRUST, or that is disputed."""
 
@@ -43,31 +47,43 @@ def find_result_evidence(boxes: Boxes, own: Boxes, assessment: Assessment | None
     """Return the evidence on boxes (N) in the ego's frame; None where claims are not assessed. own: its detections."""
     if assessment is None or assessment.claims is None:
         return None
-    xy = boxes.center[:, :2].double().numpy()
-    kinds, trust = np.zeros(len(xy), np.uint8), np.zeros(len(xy))
+    xy = boxes.center[:, :2].double().contiguous().numpy()
     trust_of = {sender.agent_id: sender.trust for sender in assessment.senders}
-    used = [claims for claims in assessment.claims if assessment.weights.get(claims.agent_id, 0.0) > 0]
-    is_near = list[NDArray[np.bool_]]()
-    for claims in used:
-        is_used = claims.kinds != Evidence.REFUTED
-        nearest = find_nearest(xy, claims.claims.xy[is_used], SAME_PLACE_M)
-        is_near.append(nearest >= 0)
-        # Of several claims at one place, the one of the highest value decides.
-        kinds = np.maximum(kinds, np.append(claims.kinds[is_used], np.uint8(0))[nearest])
-        trust = np.maximum(trust, is_near[-1] * trust_of[claims.agent_id])
-    is_own = find_nearest(xy, own.center[own.score >= MIN_OWN_SCORE, :2].double().numpy(), OWN_PLACE_M) >= 0
-    kinds[is_own], trust[is_own] = Evidence.OWN, 1.0
-    senders = _collect_senders([claims.agent_id for claims in used], is_near, len(xy))
+    used = _list_fused_claims(assessment)
+    # Of several claims at one place, the one of the highest value decides.
+    kinds, trust, is_near = find_supporting_claims(
+        xy,
+        np.concatenate([np.zeros((0, 2)), *(claims.claims.xy for claims in used)]),
+        np.concatenate([np.zeros(0, np.uint8), *(claims.kinds for claims in used)]),
+        np.cumsum([0, *(len(claims.kinds) for claims in used)]),
+        np.array([trust_of[claims.agent_id] for claims in used], np.float64),
+        _REFUTED,
+        SAME_PLACE_M,
+    )
+    seen = own.center[own.score >= MIN_OWN_SCORE, :2].double().numpy()
+    is_own = find_nearest(xy, seen, OWN_PLACE_M) >= 0
+    kinds[is_own], trust[is_own] = _OWN, 1.0
+    senders = _collect_senders([claims.agent_id for claims in used], is_near)
     return ResultEvidence(torch.from_numpy(kinds), senders, torch.from_numpy(trust))
 
 
-def _collect_senders(
-    agent_ids: Sequence[int], is_near: Sequence[NDArray[np.bool_]], count: int
-) -> tuple[tuple[int, ...], ...]:
-    found: list[tuple[int, ...]] = [()] * count
-    for agent_id, near in zip(agent_ids, is_near):
-        for row in np.flatnonzero(near).tolist():
-            found[row] += (agent_id,)
+def _list_fused_claims(assessment: Assessment) -> list[AssessedClaims]:
+    """List the claims of senders of a positive weight, and the confirmed ones of excluded senders that keep them."""
+    keeps_confirmed = {sender.agent_id for sender in assessment.senders if sender.keeps_confirmed}
+    found = list[AssessedClaims]()
+    for one in assessment.claims or ():
+        if assessment.weights.get(one.agent_id, 0.0) > 0:
+            found.append(one)
+        elif one.agent_id in keeps_confirmed:
+            found.append(AssessedClaims(one.claims[one.is_confirmed], one.kinds[one.is_confirmed]))
+    return found
+
+
+def _collect_senders(agent_ids: Sequence[int], is_near: NDArray[np.bool_]) -> tuple[tuple[int, ...], ...]:
+    """Return for each of N boxes the agents that claim it; is_near: (S, N)."""
+    found: list[tuple[int, ...]] = [()] * is_near.shape[1]
+    for sender, row in np.argwhere(is_near).tolist():
+        found[row] += (agent_ids[sender],)
     return tuple(found)
 
 
@@ -77,10 +93,11 @@ def bound_scores(boxes: Boxes, evidence: ResultEvidence) -> tuple[Boxes, ResultE
     MAX_UNCHECKED_SCORE bounds the score of a disputed box, and of an unchecked one that rests on one sender without a trust of
     MIN_TRUST.
     """
-    is_unchecked = (evidence.kinds == Evidence.UNCHECKED) & (evidence.trust < MIN_TRUST)
-    is_bounded = is_unchecked | (evidence.kinds == Evidence.DISPUTED)
-    rows = (is_bounded & (boxes.score > MAX_UNCHECKED_SCORE)).nonzero()[:, 0].tolist()
-    rows = [row for row in rows if len(evidence.senders[row]) == 1 or evidence.kinds[row] == Evidence.DISPUTED]
+    kinds = evidence.kinds.numpy()
+    is_disputed = kinds == _DISPUTED
+    is_bounded = is_disputed | ((kinds == _UNCHECKED) & (evidence.trust.numpy() < MIN_TRUST))
+    is_bounded &= boxes.score.numpy() > MAX_UNCHECKED_SCORE
+    rows = [row for row in np.flatnonzero(is_bounded).tolist() if is_disputed[row] or len(evidence.senders[row]) == 1]
     if not rows:
         return boxes, evidence
     score = boxes.score.clone()

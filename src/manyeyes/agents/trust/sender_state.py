@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from manyeyes.agents.isolation import Quarantine
 from manyeyes.agents.trust.association import Floats
 from manyeyes.agents.trust.beta_trust import BetaTrust, TrustConfig, decay
@@ -27,8 +29,9 @@ MAX_GAP_NS = 1_000_000_000
 class SenderMemory:
     """One sender: its trust at updated_ns; the capture time of its last message; tracks of its claims; objects that it omits.
 
-    reason: of its exclusion; empty if it is not excluded. contents: of its last messages; copies: which of them were copies, the
-    newest first. contradicted_ns: when its stated pose was last contradicted.
+    reason: of its exclusion; empty if it is not excluded. keeps_confirmed: it was excluded for refuted claims; those that others
+    confirm are still fused. contents: of its last messages; copies: which of them were copies, the newest first. contradicted_ns:
+    when its stated pose was last contradicted.
     """
 
     trust: BetaTrust
@@ -37,6 +40,7 @@ class SenderMemory:
     tracks: ClaimTracks
     omitted: OwnObjects
     reason: str = ""
+    keeps_confirmed: bool = False
     contents: tuple[StatedContent, ...] = ()
     copies: tuple[bool, ...] = ()
     contradicted_ns: int = NEVER_NS
@@ -73,8 +77,9 @@ class TrustState:
 def advance(state: TrustState, frame: AgentFrame, own: OwnObjects) -> tuple[TrustState, Floats, Floats]:
     """Return the state in the ego's frame of now, and the motion to it: rotation (2, 2) and shift (2,). own: objects of now."""
     gap_ns, odometry = frame.timestamp_ns - state.now_ns, frame.odometry or frame.world_from_agent
-    motion = odometry.inverse() @ state.odometry
-    rotation, shift = motion.rotation[:2, :2].numpy(), motion.translation[:2].numpy()
+    now_from_world, before = odometry.rotation.numpy().T, state.odometry
+    rotation = np.ascontiguousarray((now_from_world @ before.rotation.numpy())[:2, :2])
+    shift = (now_from_world @ (before.translation.numpy() - odometry.translation.numpy()))[:2]
     is_continued = 0 <= gap_ns <= MAX_GAP_NS
     seconds = gap_ns * 1e-9 if is_continued else 0.0
     senders = {
@@ -85,8 +90,8 @@ def advance(state: TrustState, frame: AgentFrame, own: OwnObjects) -> tuple[Trus
         if abs(frame.timestamp_ns - memory.updated_ns) <= MAX_SILENCE_NS
     }
     disputes = state.disputes.move(rotation, shift, frame.timestamp_ns) if is_continued else Disputes.empty()
-    before = state.own if is_continued else OwnObjects.empty()
-    objects = before.follow(own, rotation, shift, seconds)
+    earlier = state.own if is_continued else OwnObjects.empty()
+    objects = earlier.follow(own, rotation, shift, seconds)
     return TrustState(frame.timestamp_ns, odometry, objects, senders, state.exclusions, disputes), rotation, shift
 
 

@@ -24,22 +24,35 @@ def _direction(x: float, y: float) -> float:  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def sort_by_direction(points: F32x2, origin: F64x1) -> tuple[I64x1, I64x1]:  # pragma: no cover
-    """Return rows of points (N, 3) by sector around the origin, and the first of each sector (NUM_SECTORS + 1)."""
-    n = len(points)
-    sector = np.empty(n, np.int64)
+def sort_by_direction(points: F32x2, origin: F64x1, min_m: float) -> tuple[I64x1, I64x1]:  # pragma: no cover
+    """Return rows of the points (N, 3) at least min_m away on the ground, by sector around the origin, and the first of each sector
+    (NUM_SECTORS + 1).
+    """
+    rows, sector, count = np.empty(len(points), np.int64), np.empty(len(points), np.int64), 0
     first = np.zeros(NUM_SECTORS + 1, np.int64)
-    for i in range(n):
-        at = int(_direction(points[i, 0] - origin[0], points[i, 1] - origin[1]) * (NUM_SECTORS / 4))
-        sector[i] = min(at, NUM_SECTORS - 1)
-        first[sector[i] + 1] += 1
+    for i in range(len(points)):
+        dx, dy = points[i, 0] - origin[0], points[i, 1] - origin[1]
+        if dx * dx + dy * dy < min_m * min_m:
+            continue
+        at = min(int(_direction(dx, dy) * (NUM_SECTORS / 4)), NUM_SECTORS - 1)
+        rows[count], sector[count] = i, at
+        first[at + 1] += 1
+        count += 1
     for k in range(NUM_SECTORS):
         first[k + 1] += first[k]
-    order, place = np.empty(n, np.int64), first[:-1].copy()
-    for i in range(n):
-        order[place[sector[i]]] = i
-        place[sector[i]] += 1
+    order, place = np.empty(count, np.int64), first[:-1].copy()
+    for k in range(count):
+        order[place[sector[k]]] = rows[k]
+        place[sector[k]] += 1
     return order, first
+
+
+@njit(cache=True, nogil=True)
+def _find_nearest_m(origin: F64x1, box: F64x1, margin_m: float) -> float:  # pragma: no cover
+    """Return a distance within which nothing of an enlarged box (7) lies, on the ground."""
+    reach_x, reach_y = box[3] / 2 + margin_m, box[4] / 2 + margin_m
+    dx, dy = origin[0] - box[0], origin[1] - box[1]
+    return max(0.0, math.sqrt(dx * dx + dy * dy) - math.sqrt(reach_x * reach_x + reach_y * reach_y))
 
 
 @njit(cache=True, nogil=True)
@@ -48,7 +61,10 @@ def count_rays(points: F32x2, origin: F64x1, boxes: F64x2, margin_m: F64x1, limi
     out = np.zeros((len(boxes), 2), np.int64)
     if len(boxes) == 0 or len(points) == 0:
         return out
-    order, first = sort_by_direction(points, origin)
+    min_m = math.inf
+    for k in range(len(boxes)):
+        min_m = min(min_m, _find_nearest_m(origin, boxes[k], margin_m[k]))
+    order, first = sort_by_direction(points, origin, min_m)
     bottom, top, behind = limits[0], limits[1], limits[2]
     low, high, start, step = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for k in range(len(boxes)):
@@ -63,7 +79,7 @@ def count_rays(points: F32x2, origin: F64x1, boxes: F64x2, margin_m: F64x1, limi
         low[0], low[1], low[2] = -high[0], -high[1], -half_height + bottom
         has_core = high[0] > 0 and high[1] > 0 and high[2] > low[2]
         middle = _direction(-dx, -dy)
-        nearest = max(0.0, math.sqrt(dx * dx + dy * dy) - math.sqrt(reach_x * reach_x + reach_y * reach_y))
+        nearest = _find_nearest_m(origin, boxes[k], margin_m[k])
         left, right = 0.0, 0.0
         for a in range(-1, 2, 2):
             for b in range(-1, 2, 2):

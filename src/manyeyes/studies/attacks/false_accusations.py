@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """False accusations: how often honest senders are named malicious, on long drives without any attack.
 
-Drives are simulated while they are played: clouds are not stored. Every agent is an ego, and accuses by itself. Honest
-sender-minutes are those in which the ego received the sender, within the range of communication.
+Drives are simulated while they are played: clouds are not stored, and of a drive only the last second is held. Every agent is an
+ego, and accuses by itself. Honest sender-minutes are those in which the ego received the sender, within the range of communication.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -38,50 +38,45 @@ CACHE_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class HonestDrive:
-    """One drive under all variants and defences; what is stored is not played again."""
+    """One drive under one variant and all defences; what is stored is not played again."""
 
     spec: ScenarioSpec
+    variant: str
     options: FalseAccusationsOptions
     store: CellStore
 
     def __call__(self) -> tuple[DriveRecord, ...]:
-        """Load or play the records, by variant and defence."""
+        """Load or play the records, by defence."""
         torch.set_num_threads(1)
-        pairs = list_pairs(self.options)
-        stored = {pair: self.store.load(self.make_cell(*pair)) for pair in pairs}
-        missing = [pair for pair in pairs if stored[pair] is None]
-        for pair, record in zip(missing, self._play(missing) if missing else ()):
-            self.store.save(self.make_cell(*pair), record)
-            stored[pair] = record
+        stored = {defence: self.store.load(self.make_cell(defence)) for defence in self.options.defences}
+        missing = [defence for defence, record in stored.items() if record is None]
+        for defence, record in zip(missing, self._play(missing) if missing else ()):
+            self.store.save(self.make_cell(defence), record)
+            stored[defence] = record
         return tuple(record for record in stored.values() if record is not None)
 
-    def make_cell(self, variant: str, defence: str) -> Cell[DriveRecord]:
-        """Describe the stored record of one variant and defence."""
+    def make_cell(self, defence: str) -> Cell[DriveRecord]:
+        """Describe the stored record of one defence."""
         options, weights = self.options, load_detector(self.options.weights).fingerprint.hex()
         errors = options.position_sigma_m, options.heading_sigma_deg, options.seed
-        key = (self.spec, variant, get_misbehaviour_detector(defence), options.method, weights, errors)
-        return Cell(f"{self.spec.name}-{variant}-{defence}", DriveRecord, key, COMPUTED_BY)
+        key = (self.spec, self.variant, get_misbehaviour_detector(defence), options.method, weights, errors)
+        return Cell(f"{self.spec.name}-{self.variant}-{defence}", DriveRecord, key, COMPUTED_BY)
 
-    def _play(self, pairs: list[tuple[str, str]]) -> list[DriveRecord]:
-        """Simulate the drive once, and play it for each variant and defence."""
+    def _play(self, defences: Sequence[str]) -> list[DriveRecord]:
+        """Simulate the drive frame by frame, and play it for each defence; detector outputs are shared."""
         options, scenario = self.options, make_first_scenario(self.spec, None)
         noise = PoseNoise(seed=options.seed).at_level(options.position_sigma_m, math.radians(options.heading_sigma_deg))
-        odometry = DriftingOdometry(OdometryDrift(seed=options.seed))
-        players = [_Player.make(variant, defence, options) for variant, defence in pairs]
-        caches: dict[str, CachedOutputs] = {variant: {} for variant, _ in pairs}
-        for player in players:
-            player.replay.feature_cache = caches[player.variant]
+        odometry, change = DriftingOdometry(OdometryDrift(seed=options.seed)), make_weather(self.variant, options.seed)
+        cache: CachedOutputs = {}
+        players = [_Player.make(defence, options, cache) for defence in defences]
         for index in range(len(scenario)):
             measured = odometry.apply(scenario.snapshot(index))
-            measured = noise.apply(measured, 0) if noise else measured
-            for variant, cache in caches.items():
-                changed = make_weather(variant, options.seed)(measured)
-                for player in players:
-                    if player.variant == variant:
-                        player.add(player.replay.step(changed))
-                now = changed.frames[0].timestamp_ns
-                for key in [key for key in cache if key[1] < now - CACHE_NS]:
-                    del cache[key]
+            changed = change(noise.apply(measured, 0) if noise else measured)
+            for player in players:
+                player.add(player.replay.step(changed))
+            now = changed.frames[0].timestamp_ns
+            for key in [key for key in cache if key[1] < now - CACHE_NS]:
+                del cache[key]
         return [player.make_record(self.spec.name) for player in players]
 
 
@@ -89,13 +84,13 @@ class HonestDrive:
 class _Player:
     """One replay of all agents as egos, and what they found of senders."""
 
-    variant: str
     replay: DetectionReplay
     num_frames: int = 0
     rows: dict[int, dict[int, dict[int, SenderFrame]]] = field(default_factory=dict)
 
     @classmethod
-    def make(cls, variant: str, defence: str, options: FalseAccusationsOptions) -> _Player:
+    def make(cls, defence: str, options: FalseAccusationsOptions, cache: CachedOutputs) -> _Player:
+        """Return the replay of a defence; cache: detector outputs that are read and extended."""
         config = ReplayConfig(
             channel=CHANNEL,
             budget_bytes=BUDGET_BYTES,
@@ -104,7 +99,7 @@ class _Player:
             seed=options.seed,
             misbehaviour=get_misbehaviour_detector(defence),
         )
-        return cls(variant, DetectionReplay(options.method, load_detector(options.weights), config))
+        return cls(DetectionReplay(options.method, load_detector(options.weights), config, cache))
 
     def add(self, steps: Iterable[ReplayStep]) -> None:
         for step in steps:
@@ -131,9 +126,10 @@ class AccusationRow:
     accusations: EventRate
 
 
-def list_pairs(options: FalseAccusationsOptions) -> list[tuple[str, str]]:
-    """Return variants with defences."""
-    return [(variant, defence) for variant in options.variants for defence in options.defences]
+def make_row(variant: str, defence: str, records: Sequence[DriveRecord]) -> AccusationRow:
+    """Return the row of the drives of one variant and defence."""
+    num_senders = sum(len(record.senders) for record in records)
+    return AccusationRow(variant, defence, len(records), num_senders, count_false_accusations(records))
 
 
 def make_specs(options: FalseAccusationsOptions) -> list[ScenarioSpec]:
@@ -162,20 +158,17 @@ def run(options: FalseAccusationsOptions, context: StudyContext) -> None:
     for name in options.defences:
         get_misbehaviour_detector(name)
     context = replace(context, seed=options.seed)
-    jobs = [HonestDrive(spec, options, context.store) for spec in make_specs(options)]
-    found = context.run_jobs(jobs, options.workers, "Drives")
+    specs = make_specs(options)
+    # A job for each variant of a drive: what an interrupted study loses, and what the progress bar counts, are small.
+    jobs = [HonestDrive(spec, variant, options, context.store) for spec in specs for variant in options.variants]
+    found = context.run_jobs(jobs, options.workers, "Drives and their variants")
     rows = tuple(
-        AccusationRow(
-            variant,
-            defence,
-            len(found),
-            sum(len(records[k].senders) for records in found),
-            count_false_accusations([records[k] for records in found]),
-        )
-        for k, (variant, defence) in enumerate(list_pairs(options))
+        make_row(variant, defence, [records[k] for job, records in zip(jobs, found) if job.variant == variant])
+        for variant in options.variants
+        for k, defence in enumerate(options.defences)
     )
-    title = f"{len(found)} drives of {options.seconds:g} s in {', '.join(options.towns)}, every agent as ego, {options.method}"
-    context.write_report(title, {"rows": rows}, [make_table(rows)], config={"specs": make_specs(options)})
+    title = f"{len(specs)} drives of {options.seconds:g} s in {', '.join(options.towns)}, every agent as ego, {options.method}"
+    context.write_report(title, {"rows": rows}, [make_table(rows)], config={"specs": specs})
 
 
 def make_table(rows: tuple[AccusationRow, ...]) -> StudyTable:

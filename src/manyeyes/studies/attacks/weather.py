@@ -11,11 +11,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from manyeyes.datatypes import AgentFrame, Boxes, PointCloud, Snapshot
 from manyeyes.ops.keyed_random import keyed_uniform
+from manyeyes.studies.attacks._weather_kernels import find_window_returns
+
+WINDOW_MARGIN_M = 0.1
+"""Maximum distance of a return of a window from its vehicle."""
 
 
 @dataclass(frozen=True)
@@ -32,15 +37,9 @@ class GlassReturns:
     def apply(self, frame: AgentFrame, objects: Boxes, unit: Tensor) -> PointCloud:
         """Return the changed cloud; objects (N) in the frame's axes, unit (P, 3) uniform."""
         points = frame.points
-        in_window = torch.zeros(len(points), dtype=torch.bool)
-        low, high = self.window_band
-        for row in range(len(objects)):
-            box = objects[row : row + 1].to(points.xyz.dtype)
-            bottom, height = box.center[0, 2] - box.size[0, 2] / 2, box.size[0, 2]
-            share = (points.xyz[:, 2] - bottom) / height
-            candidates = ((share >= low) & (share <= high)).nonzero()[:, 0]
-            candidates = candidates[(points.xyz[candidates, :2] - box.center[0, :2]).norm(dim=1) < box.size[0, 0]]
-            in_window[candidates] |= box.contains(points.xyz[candidates], 0.1)[0]
+        boxes = torch.cat((objects.center, objects.size, objects.yaw[:, None]), 1).double().numpy()
+        xyz = np.ascontiguousarray(points.xyz.float().numpy())
+        in_window = torch.from_numpy(find_window_returns(xyz, boxes, *self.window_band, WINDOW_MARGIN_M))
         passes = in_window & (unit[:, 0] >= self.lost) & (unit[:, 0] < self.lost + self.behind)
         extra_m = torch.where(passes, self.max_behind_m * unit[:, 1].float(), 0.0)
         moved = _extend(points.xyz, frame.sensor_height_m, extra_m)

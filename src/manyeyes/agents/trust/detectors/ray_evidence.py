@@ -202,7 +202,10 @@ class RayEvidenceDetector(MisbehaviourDetector):
         if exclusions.contains(agent_id, now.now_ns):
             return memory, exclusions
         if named or (is_low and not memory.reason):
-            return replace(memory, reason=named or LOW_TRUST), exclusions.add(agent_id, now.now_ns)
+            is_copier = sum(memory.copies) >= self.copies.min_copies
+            is_refuted = bool(count_refuted_checks(memory.tracks, self.naming.min_score).any())
+            memory = replace(memory, reason=named or LOW_TRUST, keeps_confirmed=is_refuted and not is_copier)
+            return memory, exclusions.add(agent_id, now.now_ns)
         if memory.reason:
             memory = replace(memory, trust=BetaTrust(*self.trust.returned), reason="")
         return memory, exclusions
@@ -280,7 +283,8 @@ class RayEvidenceDetector(MisbehaviourDetector):
     ) -> SenderAssessment:
         trust = memory.trust.mean
         if is_excluded:
-            return SenderAssessment(agent_id, trust, 0.0, SenderStatus.MALICIOUS, memory.reason)
+            keeps_confirmed = memory.keeps_confirmed and not is_faulty and agent_id not in found.unused
+            return SenderAssessment(agent_id, trust, 0.0, SenderStatus.MALICIOUS, memory.reason, keeps_confirmed)
         if agent_id in found.contradicted:
             reason = "its claims have a common offset to the ego's detections"
             return SenderAssessment(agent_id, trust, 0.0, SenderStatus.FAULTY, reason)
@@ -307,8 +311,9 @@ class _Detections:
 
     @classmethod
     def of(cls, own: Boxes) -> _Detections:
-        columns = [part.double().numpy() for part in (own.center, own.size, own.yaw[:, None])]
-        return cls(np.concatenate(columns, 1), own.velocity.double().numpy(), own.score.double().numpy())
+        columns = np.empty((len(own), 7))
+        columns[:, :3], columns[:, 3:6], columns[:, 6] = own.center.numpy(), own.size.numpy(), own.yaw.numpy()
+        return cls(columns, own.velocity.double().numpy(), own.score.double().numpy())
 
     def places(self, min_score: float) -> Floats:
         """Return the centres (M, 2) of those of a score."""
