@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trains a detector or a map model on recordings, FeaKM on what a detector sees, or the learned matcher on generated scenes; goes on
-where a stopped run was.
+"""Trains a detector or a map model on recordings, FeaKM on what a detector sees, or a matcher on generated scenes; goes on where a
+stopped run was.
 
 A plan (costr-small, costr-base) trains several stages and fits the codebook, from nothing to the weights that ship.
 

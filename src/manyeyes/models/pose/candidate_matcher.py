@@ -153,8 +153,8 @@ def _cross_features(batch: CandidateBatch, moved: Tensor, yaw: Tensor, is_pair: 
 
 @dataclass(frozen=True, eq=False)
 class _AlignedPairs:
-    """Pairs under their candidate's pose. a, b: (B, K, P, 9) boxes; middle (B, K, P, 2) m and axis (B, K, P) rad in the ego's frame;
-    residual (B, K, P, 2) m and turn (B, K, P) rad of the ego's against the other's; is_flipped: headings differ by pi.
+    """Pairs under their candidate's pose. a, b: (B, K, P, 9) boxes; middle (B, K, P, 2) m and axis (B, K, P) rad in the ego's
+    frame; residual (B, K, P, 2) m and turn (B, K, P) rad of the ego's against the other's; is_flipped: headings differ by pi.
     """
 
     a: Tensor

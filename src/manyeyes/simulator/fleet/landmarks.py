@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -91,8 +92,6 @@ class LandmarkSpec:
     other_layout: StreetLayout | None = None
 
     def __post_init__(self) -> None:
-        if self.parked_fraction is not None and self.layout is not None:
-            raise ConfigError("LandmarkSpec.parked_fraction needs the default layout.")
         if min(self.num_ego_only, self.num_other_only, self.num_common or 0) < 0 or self.num_instants < 1:
             raise ConfigError("LandmarkSpec needs counts of at least 0 and at least one instant.")
         if self.body_offset_m is not None and self.placement == "roadside":
@@ -136,7 +135,7 @@ def make_landmark_scene(spec: LandmarkSpec, seed: int, scene: int) -> LandmarkSc
     # Draws of their own, so that they leave the scenes of simpler specifications as they are.
     extra_rng = keyed_generator(seed, "landmark extras", scene)
     if spec.parked_fraction is not None:
-        there = make_later_traffic(here, extra_rng, spec.parked_fraction)
+        there = make_later_traffic(here, extra_rng, spec.parked_fraction, partial(_make_traffic, spec.layout))
     if spec.placement != "roadside":
         unit = place_vehicle_near(ego_now, spec.placement, extra_rng)
     observers = _Observer(spec, here, extra_rng), _Observer(spec, there, extra_rng)

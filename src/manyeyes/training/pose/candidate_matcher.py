@@ -38,13 +38,14 @@ class CandidateMatcherTrainConfig(TrainConfig):
 
 CANDIDATE_MATCHER_TRAINING_PRESETS: dict[str, CandidateMatcherTrainConfig] = {
     "pose-matcher-small": CandidateMatcherTrainConfig(
-        steps=1500,
+        steps=600,
         batch=32,
         micro_batch=SCENES_PER_DENSITY,
-        learning_rate=1.5e-3,
+        learning_rate=2e-3,
         max_grad_norm=2.0,
-        ema_decay=0.99,
-        save_every=100,
+        ema_decay=0.98,
+        warmup_steps=50,
+        save_every=50,
     )
 }
 """The shipped weights."""

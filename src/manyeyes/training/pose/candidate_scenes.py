@@ -50,7 +50,7 @@ def draw_spec(rng: np.random.Generator, density: float) -> LandmarkSpec:
     common = int(rng.choice(list(_COMMON), p=list(_COMMON.values())))
     noise, kind = _draw_noise(rng), rng.random()
     clutter = SensorClutter(int(rng.integers(1, 5)), 0.0) if rng.random() < 0.15 else SensorClutter()
-    layout = draw_layout(rng) if rng.random() < 0.6 else None
+    layout = draw_layout(rng) if rng.random() < 0.75 else None
     placement: Placement = "near" if rng.random() < 0.2 else "roadside"
     if kind < 0.33:
         # As many boxes as where some are in common, so that their number says nothing.
@@ -59,7 +59,8 @@ def draw_spec(rng: np.random.Generator, density: float) -> LandmarkSpec:
         return LandmarkSpec(0, *numbers, noise, True, clutter=clutter, layout=layout, other_layout=elsewhere)
     if kind < 0.47:
         fraction = rng.uniform(0.2, 0.7)
-        return LandmarkSpec(0, ego + common, other + common, noise, parked_fraction=fraction, clutter=clutter)
+        numbers = ego + common, other + common
+        return LandmarkSpec(0, *numbers, noise, parked_fraction=fraction, clutter=clutter, layout=layout)
     return LandmarkSpec(common, ego, other, noise, clutter=clutter, placement=placement, layout=layout)
 
 
