@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trains a detector or a map model on recordings, FeaKM on what a detector sees, or a matcher on generated scenes; goes on where a
-stopped run was.
+"""Trains a detector or a map model on recordings, FeaKM on what a detector sees, or a verifier of poses on generated scenes; goes
+on where a stopped run was.
 
 A plan (costr-small, costr-base) trains several stages and fits the codebook, from nothing to the weights that ship.
 
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from manyeyes.training.detector.plan import TrainPlan
     from manyeyes.training.devices import Execution
     from manyeyes.training.maps.task import MapTask, MapTrainConfig
+    from manyeyes.training.pose.candidate_verifier import CandidateVerifierTask, CandidateVerifierTrainConfig
     from manyeyes.training.pose.feakm import FeakmTask, FeakmTrainConfig
     from manyeyes.training.pose.feakm_cache import FeatureCache
     from manyeyes.training.trainer import Task, TrainConfig
@@ -111,13 +112,13 @@ def main(options: Options) -> None:
     from manyeyes.datatypes import ConfigError
     from manyeyes.training.config_file import print_config
     from manyeyes.training.devices import Execution, open_device
-    from manyeyes.training.pose.candidate_matcher import CandidateMatcherTrainConfig
+    from manyeyes.training.pose.candidate_verifier import CandidateVerifierTrainConfig
 
     chosen, out = choose_preset(options), options.out or Path("runs") / options.preset
     if options.print_config:
         print(print_config(chosen), end="")
         return
-    is_generated = isinstance(chosen, CandidateMatcherTrainConfig)
+    is_generated = isinstance(chosen, CandidateVerifierTrainConfig)
     if is_generated == bool(options.data):
         raise ConfigError(
             f"{options.preset} is trained on generated scenes; leave out --data."
@@ -193,15 +194,15 @@ def _train(
     from manyeyes._io import remove_unfinished
     from manyeyes.datasets.missing import NONE_MISSING
     from manyeyes.training.detector.plan import TrainPlan
-    from manyeyes.training.pose.candidate_matcher import CandidateMatcherTask, CandidateMatcherTrainConfig
+    from manyeyes.training.pose.candidate_verifier import CandidateVerifierTrainConfig
     from manyeyes.viz.progress import make_progress_bars
 
     missing = NONE_MISSING
-    if isinstance(chosen, CandidateMatcherTrainConfig):
+    if isinstance(chosen, CandidateVerifierTrainConfig):
         if not console.quiet:
             remove_unfinished(out)
         with make_progress_bars(console) as bars:
-            run = _run_task(options, CandidateMatcherTask(chosen, options.seed), out, execution, bars)
+            run = _run_task(options, _make_verifier_task(options, chosen, out, bars), out, execution, bars)
     else:
         recording, missing = _open_training_recording(options, chosen, console)
         if not console.quiet:
@@ -342,6 +343,20 @@ def _make_task(
         return _make_map_task(options, config, recording)
     assert isinstance(config, FeakmTrainConfig)
     return _make_feakm_task(options, config, recording, missing, bars)
+
+
+def _make_verifier_task(
+    options: Options, config: CandidateVerifierTrainConfig, out: Path, bars: ProgressBars
+) -> CandidateVerifierTask:
+    """Generate the scenes of a seed under the folder of the run, or read those that are there."""
+    from manyeyes.training.pose.candidate_scenes import LabelledCandidates, build_scenes
+    from manyeyes.training.pose.candidate_verifier import CandidateVerifierTask
+
+    row, parts = bars.add_task("Generating scenes", total=config.num_scenes), list[LabelledCandidates]()
+    for part in build_scenes(out / f"scenes-{options.seed}", options.seed, config.num_scenes):
+        parts.append(part)
+        bars.update(row, advance=len(part.exists))
+    return CandidateVerifierTask(config, LabelledCandidates.cat(parts), options.seed)
 
 
 def _make_map_task(options: Options, config: MapTrainConfig, recording: Recording) -> MapTask:

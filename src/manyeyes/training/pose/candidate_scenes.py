@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Endless generated scenes with the candidates of the vote, on which the learned matcher is trained.
+"""Endless generated scenes with the candidates of the vote, on which their verification is trained.
 
 Half of the scenes have few objects in common; the others are of agents at two places, and at one place minutes apart. Streets,
 numbers of boxes, errors of boxes, false boxes and placements vary from scene to scene; a scene is a pure function of seed and
@@ -8,14 +8,18 @@ number.
 
 from __future__ import annotations
 
+import io
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from manyeyes._io import atomic_write
 from manyeyes.ops.keyed_random import keyed_generator
-from manyeyes.pose.candidate_batch import CandidateSet
+from manyeyes.pose.candidate_features import compute_features
 from manyeyes.pose.corrector import DETECTOR_BOXES_CONFIG
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.voting import find_candidates
@@ -23,9 +27,8 @@ from manyeyes.simulator.fleet.landmark_errors import REAL_BOXES, BoxNoise, Measu
 from manyeyes.simulator.fleet.landmarks import LandmarkSpec, Placement, SensorClutter, make_landmark_scene
 from manyeyes.simulator.fleet.street_layouts import draw_layout
 
-SCENES_PER_DENSITY = 16
-"""Scenes with similar numbers of boxes, so that little of a batch is padding."""
 MAX_TRAINING_CANDIDATES = 3
+SCENES_PER_FILE = 500
 RIGHT = 2.0
 """Metres and degrees within which a candidate is right."""
 UNCLEAR = 4.0, 5.0
@@ -35,22 +38,27 @@ _COMMON = {2: 0.06, 3: 0.26, 4: 0.26, 5: 0.2, 6: 0.1, 7: 0.06, 8: 0.06}
 
 @dataclass(frozen=True, eq=False)
 class LabelledCandidates:
-    """candidates: a scene. is_right, is_unclear: (K,) bool. is_match: (K, P) bool, pairs that are one object."""
+    """Candidates of S scenes. features: (S, K, NUM_FEATURES); exists, is_right, is_unclear: (S, K) bool."""
 
-    candidates: CandidateSet
+    features: NDArray[np.float32]
+    exists: NDArray[np.bool_]
     is_right: NDArray[np.bool_]
     is_unclear: NDArray[np.bool_]
-    is_match: NDArray[np.bool_]
+
+    @classmethod
+    def cat(cls, many: Sequence[LabelledCandidates]) -> LabelledCandidates:
+        """Concatenate scenes."""
+        return cls(*(np.concatenate([getattr(m, f.name) for m in many]) for f in fields(cls)))
 
 
-def draw_spec(rng: np.random.Generator, density: float) -> LandmarkSpec:
-    """Draw the specification of a scene; density: in [0, 1), the logarithm of the number of boxes."""
-    ego = round(5 * 8 ** (density**1.4) * rng.uniform(0.85, 1.15))
-    other = round(ego * rng.uniform(0.95, 1.35))
+def draw_spec(rng: np.random.Generator) -> LandmarkSpec:
+    """Draw the specification of a scene."""
+    ego = round(5 * 7 ** rng.random())
+    other = round(ego * rng.uniform(0.9, 1.4))
     common = int(rng.choice(list(_COMMON), p=list(_COMMON.values())))
     noise, kind = _draw_noise(rng), rng.random()
     clutter = SensorClutter(int(rng.integers(1, 5)), 0.0) if rng.random() < 0.15 else SensorClutter()
-    layout = draw_layout(rng) if rng.random() < 0.75 else None
+    layout = draw_layout(rng) if rng.random() < 0.8 else None
     placement: Placement = "near" if rng.random() < 0.2 else "roadside"
     if kind < 0.33:
         # As many boxes as where some are in common, so that their number says nothing.
@@ -82,25 +90,32 @@ def _draw_noise(rng: np.random.Generator) -> BoxNoise | MeasuredBoxErrors:
 
 
 def make_labelled_candidates(spec: LandmarkSpec, seed: int, number: int) -> LabelledCandidates:
-    """Make a scene with the vote's candidates and their labels."""
+    """Make one scene with the vote's best candidates and their labels."""
     scene = make_landmark_scene(spec, seed, number)
     ego, other = (Landmarks.of_boxes(boxes[0]) for boxes in (scene.ego, scene.other))
-    found = find_candidates(ego, other, DETECTOR_BOXES_CONFIG.vote)[:MAX_TRAINING_CANDIDATES]
-    candidates = CandidateSet.of(ego, other, found, MAX_TRAINING_CANDIDATES)
-    error = candidates.pose.astype(np.float64) - scene.ego_from_other
-    away, turn = (
-        np.hypot(error[:, 0], error[:, 1]),
-        np.degrees(np.abs(np.remainder(error[:, 2] + np.pi, 2 * np.pi) - np.pi)),
-    )
-    exists = np.arange(MAX_TRAINING_CANDIDATES) < len(found)
-    is_right = exists & (away < RIGHT) & (turn < RIGHT)
-    is_unclear = exists & (away < UNCLEAR[0]) & (turn < UNCLEAR[1]) & ~is_right
-    true_pairs = {(int(i), int(k)) for i, k in scene.common_pairs}
-    is_match = np.array([[(int(i), int(k)) in true_pairs for i, k in pairs] for pairs in candidates.pairs])
-    return LabelledCandidates(candidates, is_right, is_unclear, is_match)
+    found = find_candidates(ego, other, DETECTOR_BOXES_CONFIG.vote)
+    features, exists = compute_features(ego, other, found, MAX_TRAINING_CANDIDATES)
+    pose = np.zeros((MAX_TRAINING_CANDIDATES, 3))
+    for k, one in enumerate(found[:MAX_TRAINING_CANDIDATES]):
+        pose[k] = one.pose
+    error = pose - scene.ego_from_other
+    away, turn = np.hypot(error[:, 0], error[:, 1]), np.abs(np.remainder(error[:, 2] + np.pi, 2 * np.pi) - np.pi)
+    is_right = exists & (away < RIGHT) & (turn < math.radians(RIGHT))
+    is_unclear = exists & (away < UNCLEAR[0]) & (turn < math.radians(UNCLEAR[1])) & ~is_right
+    return LabelledCandidates(features[None], exists[None], is_right[None], is_unclear[None])
 
 
-def draw_labelled_candidates(seed: int, number: int) -> LabelledCandidates:
-    """Draw the scene of this number from an endless, keyed stream; consecutive ones have similar numbers of boxes."""
-    density = keyed_generator(seed, "candidate density", number // SCENES_PER_DENSITY).random()
-    return make_labelled_candidates(draw_spec(keyed_generator(seed, "candidate scene", number), density), seed, number)
+def build_scenes(folder: Path, seed: int, count: int) -> Iterator[LabelledCandidates]:
+    """Yield count scenes of a seed in parts; parts that are in the folder are read, so that an interrupted build continues."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for first in range(0, count, SCENES_PER_FILE):
+        path = folder / f"{first:07d}.npz"
+        if not path.exists():
+            numbers = range(first, first + SCENES_PER_FILE)
+            specs = [draw_spec(keyed_generator(seed, "candidate scene", n)) for n in numbers]
+            part = LabelledCandidates.cat([make_labelled_candidates(s, seed, n) for s, n in zip(specs, numbers)])
+            content = io.BytesIO()
+            np.savez(content, **{f.name: getattr(part, f.name) for f in fields(part)})
+            atomic_write(path, content.getvalue(), durable=False)
+        with np.load(path) as stored:
+            yield LabelledCandidates(*(stored[f.name] for f in fields(LabelledCandidates)))
