@@ -72,7 +72,7 @@ def test_unusable_landmarks_change_nothing() -> None:
 
 def test_more_boxes_than_in_training_are_judged_by_the_vote() -> None:
     _, ego, other = make_scene(5, 2)
-    learned = LearnedVotingCorrector(pretrained.load_pose_matcher(), LearnedVotingConfig(max_landmarks=10))
+    learned = LearnedVotingCorrector(pretrained.load_pose_verifier(), LearnedVotingConfig(max_landmarks=10))
     found = find_candidates(ego, other, DETECTOR_BOXES_CONFIG.vote)
     wanted = decide(found, None, DETECTOR_BOXES_CONFIG.accept)
     estimate = learned(ego, other, None)

@@ -356,7 +356,7 @@ FIGURES = {
     ),
     "acceptance-roc": StoredFigure(
         "True pairs that are answered right against null pairs that are answered wrongly",
-        "python -m benchmarks.pose_matcher",
+        "python -m benchmarks.pose_verifier",
         _make_acceptance_roc,
     ),
     "pose-noise": StoredFigure(

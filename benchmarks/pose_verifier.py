@@ -6,8 +6,8 @@ one process. ``candidates``: is the right pose the best of the vote, among its b
 true pairs with an answer within 1 m and 1 degree. ``nulls``: fraction of null pairs with a wrong answer (one place: more than 3 m
 off). ``time``: processor time. The curves vary the limit of the vote's score, and of the network's log-odds.
 
-python -m benchmarks.pose_matcher [--scenes 600] [--nulls 3000] [--weights pose-matcher-small] [--seed 2025]
-    [--out benchmarks/results/pose_matcher.json]
+python -m benchmarks.pose_verifier [--scenes 600] [--nulls 3000] [--weights pose-verifier-small] [--seed 2025]
+    [--out benchmarks/results/pose_verifier.json]
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 from benchmarks.pose_real import SEED, Line, make_mean_line, make_rate_line, observe
 from numpy.typing import NDArray
 
-from manyeyes.models.pretrained import DEFAULT_POSE_MATCHER
+from manyeyes.models.pretrained import DEFAULT_POSE_VERIFIER
 from manyeyes.pose.corrector import DETECTOR_BOXES_CONFIG, decide
 from manyeyes.pose.learned_voting import LEARNED_VOTING, LearnedVotingCorrector, load_learned_voting
 from manyeyes.pose.types import pose_difference
@@ -188,13 +188,13 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--scenes", type=int, default=600)
     parser.add_argument("--nulls", type=int, default=3000)
-    parser.add_argument("--weights", default=DEFAULT_POSE_MATCHER)
+    parser.add_argument("--weights", default=DEFAULT_POSE_VERIFIER)
     parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/pose_matcher.json"))
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results/pose_verifier.json"))
     options = parser.parse_args()
     lines, roc = run(load_learned_voting(options.weights), options.seed, options.scenes, options.nulls)
-    command = f"python -m benchmarks.pose_matcher {shlex.join(sys.argv[1:])}".strip()
-    result = {"benchmark": "pose_matcher", "command": command, "lines": [asdict(line) for line in lines], "roc": roc}
+    command = f"python -m benchmarks.pose_verifier {shlex.join(sys.argv[1:])}".strip()
+    result = {"benchmark": "pose_verifier", "command": command, "lines": [asdict(line) for line in lines], "roc": roc}
     write_json(options.out, result, {"command": command}, options.seed)
 
 
