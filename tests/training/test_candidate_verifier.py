@@ -42,9 +42,7 @@ def test_scenes_are_functions_of_their_seed_and_an_interrupted_build_goes_on(
     assert [len(part.exists) for part in parts] == [3, 3]
     other = LabelledCandidates.cat(list(build_scenes(tmp_path / "two", 8, 3)))
     assert (other.features != parts[0].features).any()
-    begun = build_scenes(tmp_path / "three", 7, 6)
-    next(begun)
-    begun.close()
+    next(build_scenes(tmp_path / "three", 7, 6))
     again = list(build_scenes(tmp_path / "three", 7, 6))
     for part, wanted in zip(again, parts, strict=True):
         np.testing.assert_array_equal(part.features, wanted.features)
