@@ -24,7 +24,7 @@ class CandidateVerifierTrainConfig(TrainConfig):
 
     net: CandidateVerifierConfig = CandidateVerifierConfig()
     _: KW_ONLY
-    num_scenes: int = 10000
+    num_scenes: int = 16000
 
 
 CANDIDATE_VERIFIER_TRAINING_PRESETS: dict[str, CandidateVerifierTrainConfig] = {
