@@ -7,8 +7,11 @@ A scene is a choice among its candidates and "none is right", by cross entropy.
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass
+from functools import lru_cache
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
@@ -43,6 +46,11 @@ def choice_loss(odds: Tensor, is_right: Tensor, is_unclear: Tensor) -> Tensor:
     return (every.logsumexp(1) - every.masked_fill(~target, MASKED_LOGIT).logsumexp(1)).mean()
 
 
+@lru_cache(maxsize=2)
+def _permute(seed: int, round_number: int, count: int) -> NDArray[np.int64]:
+    return keyed_generator(seed, "candidate order", round_number).permutation(count)
+
+
 @dataclass
 class CandidateVerifierTask(Task[CandidateVerifierTrainConfig, CandidateVerifier, int]):
     """Train the network on labelled scenes; a sample is the number of a scene."""
@@ -62,8 +70,7 @@ class CandidateVerifierTask(Task[CandidateVerifierTrainConfig, CandidateVerifier
     def draw(self, number: int) -> int:
         """Draw a scene: every one once before any is drawn again, in another order each time."""
         count = len(self.scenes.exists)
-        order = keyed_generator(self.seed, "candidate order", number // count).permutation(count)
-        return int(order[number % count])
+        return int(_permute(self.seed, number // count, count)[number % count])
 
     def loss(
         self, model: CandidateVerifier, samples: list[int], numbers: range, step: int
