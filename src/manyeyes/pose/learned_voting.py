@@ -41,7 +41,7 @@ class LearnedVotingConfig:
     vote: CorrectorConfig = DETECTOR_BOXES_CONFIG
     accept: AcceptanceTest = field(
         default_factory=lambda: AcceptanceTest(
-            min_score=5.0, score_per_log_pair=0.0, min_margin=3.0, runner_up_margin_pairs=0.0, conflict_margin=5.0
+            min_score=6.0, score_per_log_pair=0.0, min_margin=3.0, runner_up_margin_pairs=0.0, conflict_margin=5.0
         )
     )
     max_candidates: int = 3
