@@ -82,10 +82,12 @@ class LearnedVotingCorrector:
         place = [np.full(len(x), -1, np.int64) for x in (ego, other)]
         for rows, at in zip(kept, place):
             at[rows] = np.arange(len(rows))
-        usable = [
-            replace(one, pairs=np.stack((place[0][one.pairs[:, 0]], place[1][one.pairs[:, 1]]), 1)) for one in ranked
+        count = self.config.max_candidates
+        best = [
+            replace(one, pairs=np.stack((place[0][one.pairs[:, 0]], place[1][one.pairs[:, 1]]), 1))
+            for one in ranked[:count]
         ]
-        features, exists = compute_features(ego[kept[0]], other[kept[1]], usable, self.config.max_candidates)
+        features, exists = compute_features(ego[kept[0]], other[kept[1]], [*best, *ranked[count:]], count)
         odds = self.net(torch.from_numpy(features), torch.from_numpy(exists))
         return odds[: len(ranked)].double().numpy()
 
