@@ -151,6 +151,7 @@ def test_doctor_names_damaged_weights_and_exits_with_1(monkeypatch, capsys, tmp_
         "map-small-camera",
         "map-small-fusion",
         "map-small-lidar",
+        "pose-verifier-small",
     }
     assert set(statuses) == expected
     assert f"1,000 bytes instead of {len(whole):,}" in statuses["costr-small"]["problem"]

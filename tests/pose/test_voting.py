@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from manyeyes.pose import _voting_kernels as loops
-from manyeyes.pose.corrector import _prior_log_ratios, mahalanobis_squared
+from manyeyes.pose.corrector import mahalanobis_squared, prior_log_ratios
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.size_evidence import compute_size_evidence
 from manyeyes.pose.types import PosePrior
@@ -214,11 +214,11 @@ def test_the_prior_raises_scores_by_its_density_over_that_of_a_uniform_pose():
     for turn in (3.1, -3.12, 0.4):
         pose = np.array([1.3, 2.2, turn])
         candidates.append(Candidate(pose, np.diag(rng.random(3) + 0.01), np.zeros((3, 2), int), 9.0, 1.0, 6))
-    found = _prior_log_ratios(candidates, prior, 2e5)
+    found = prior_log_ratios(candidates, prior, 2e5)
     for candidate, ratio in zip(candidates, found):
         spread = candidate.covariance + prior.covariance
         density = -(mahalanobis_squared(candidate.pose, candidate.covariance, prior)) / 2
         density -= math.log(math.sqrt(np.linalg.det(2 * np.pi * spread)))
         assert ratio == pytest.approx(max(0.0, density + math.log(2e5)), abs=1e-9)
     assert found[0] > 5 and found[2] < found[0]
-    assert _prior_log_ratios(candidates, None, 2e5) == [0.0] * 3
+    assert prior_log_ratios(candidates, None, 2e5) == [0.0] * 3

@@ -51,8 +51,8 @@ class Options:
     frames: PositiveInt = 60
     """At most so many evaluated frames."""
     correctors: tuple[str, ...] = ("identity", "voting")
-    """Any of voting, identity, coalign, fpv-rcnn, feaco, icp, vips, clipper, max-clique, v2x-reg-odist, v2x-reg-oiou, mash, feakm,
-    or a .safetensors file of FeaKM; of whole clouds scan-registration and gicp."""
+    """Any of voting, learned-voting, identity, coalign, fpv-rcnn, feaco, icp, vips, clipper, max-clique, v2x-reg-odist,
+    v2x-reg-oiou, mash, feakm, or a .safetensors file of FeaKM; of whole clouds scan-registration and gicp."""
     noise_xy_m: LengthM = 0.0
     """Standard deviation of errors of collaborators' prior positions."""
     noise_yaw_deg: AngleDeg = 0.0

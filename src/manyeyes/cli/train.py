@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trains a detector or a map model on recordings, or FeaKM on what a detector sees; goes on where a stopped run was.
+"""Trains a detector or a map model on recordings, FeaKM on what a detector sees, or a verifier of poses on generated scenes; goes
+on where a stopped run was.
 
 A plan (costr-small, costr-base) trains several stages and fits the codebook, from nothing to the weights that ship.
 
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from manyeyes.training.detector.plan import TrainPlan
     from manyeyes.training.devices import Execution
     from manyeyes.training.maps.task import MapTask, MapTrainConfig
+    from manyeyes.training.pose.candidate_verifier import CandidateVerifierTask, CandidateVerifierTrainConfig
     from manyeyes.training.pose.feakm import FeakmTask, FeakmTrainConfig
     from manyeyes.training.pose.feakm_cache import FeatureCache
     from manyeyes.training.trainer import Task, TrainConfig
@@ -110,13 +112,19 @@ def main(options: Options) -> None:
     from manyeyes.datatypes import ConfigError
     from manyeyes.training.config_file import print_config
     from manyeyes.training.devices import Execution, open_device
+    from manyeyes.training.pose.candidate_verifier import CandidateVerifierTrainConfig
 
     chosen, out = choose_preset(options), options.out or Path("runs") / options.preset
     if options.print_config:
         print(print_config(chosen), end="")
         return
-    if not options.data:
-        raise ConfigError("--data is missing: name the recordings to train on.")
+    is_generated = isinstance(chosen, CandidateVerifierTrainConfig)
+    if is_generated == bool(options.data):
+        raise ConfigError(
+            f"{options.preset} is trained on generated scenes; leave out --data."
+            if is_generated
+            else "--data is missing: name the recordings to train on."
+        )
     torch.set_num_threads(options.threads)
     with open_device(options.compute.device) as device:
         is_first = not dist.is_initialized() or dist.get_rank() == 0
@@ -184,27 +192,45 @@ def _train(
     options: Options, chosen: TrainConfig | TrainPlan, out: Path, execution: Execution, console: Console
 ) -> None:
     from manyeyes._io import remove_unfinished
+    from manyeyes.datasets.missing import NONE_MISSING
+    from manyeyes.training.detector.plan import TrainPlan
+    from manyeyes.training.pose.candidate_verifier import CandidateVerifierTrainConfig
+    from manyeyes.viz.progress import make_progress_bars
+
+    missing = NONE_MISSING
+    if isinstance(chosen, CandidateVerifierTrainConfig):
+        if not console.quiet:
+            remove_unfinished(out)
+        with make_progress_bars(console) as bars:
+            run = _run_task(options, _make_verifier_task(options, chosen, out, bars), out, execution, bars)
+    else:
+        recording, missing = _open_training_recording(options, chosen, console)
+        if not console.quiet:
+            remove_unfinished(out, below=isinstance(chosen, TrainPlan))
+        with make_progress_bars(console) as bars:
+            if isinstance(chosen, TrainPlan):
+                run = _train_plan(options, chosen, out, execution, recording, bars)
+            else:
+                task = _make_task(options, chosen, recording, missing, bars)
+                run = _run_task(options, task, out, execution, bars)
+    if not console.quiet:
+        _write_record(options, run, missing, out, console)
+
+
+def _open_training_recording(
+    options: Options, chosen: TrainConfig | TrainPlan, console: Console
+) -> tuple[RecordingReader, MissingFiles]:
+    """Open what is trained on, with images where the preset needs them, and check its files."""
     from manyeyes.datasets.mixed import open_recordings
     from manyeyes.studies.map_recordings import check_images
     from manyeyes.studies.recordings import check_files
-    from manyeyes.training.detector.plan import TrainPlan
     from manyeyes.training.maps.task import MapTrainConfig
-    from manyeyes.viz.progress import make_progress_bars
 
     has_cameras = isinstance(chosen, MapTrainConfig) and "camera" in chosen.map_model.bev.sensors
     recording = open_recordings(options.data, options.split, images=has_cameras, weights=options.data_weights)
     if has_cameras:
         check_images(recording, " ".join(map(str, options.data)))
-    missing = check_files(recording, options.checks, console)
-    if not console.quiet:
-        remove_unfinished(out, below=isinstance(chosen, TrainPlan))
-    with make_progress_bars(console) as bars:
-        if isinstance(chosen, TrainPlan):
-            run = _train_plan(options, chosen, out, execution, recording, bars)
-        else:
-            run = _train_stage(options, chosen, out, execution, recording, missing, bars)
-    if not console.quiet:
-        _write_record(options, run, missing, out, console)
+    return recording, check_files(recording, options.checks, console)
 
 
 @dataclass(frozen=True)
@@ -242,19 +268,12 @@ def _make_card(options: Options, settings: TrainConfig | TrainPlan) -> dict[str,
     return {name: origin[name] for name in ("command", "versions", "git_commit")}
 
 
-def _train_stage(
-    options: Options,
-    config: TrainConfig,
-    out: Path,
-    execution: Execution,
-    recording: RecordingReader,
-    missing: MissingFiles,
-    bars: ProgressBars,
+def _run_task(
+    options: Options, task: Task[Any, Any, Any], out: Path, execution: Execution, bars: ProgressBars
 ) -> _FinishedRun:
     from manyeyes.training.monitor import Progress
     from manyeyes.training.trainer import Trainer
 
-    task = _make_task(options, config, recording, missing, bars)
     card = _make_card(options, task.config)
     trainer = Trainer(task, out, execution.device, execution.workers, execution.tensorboard)
     row = bars.add_task("Training", total=task.steps)
@@ -324,6 +343,20 @@ def _make_task(
         return _make_map_task(options, config, recording)
     assert isinstance(config, FeakmTrainConfig)
     return _make_feakm_task(options, config, recording, missing, bars)
+
+
+def _make_verifier_task(
+    options: Options, config: CandidateVerifierTrainConfig, out: Path, bars: ProgressBars
+) -> CandidateVerifierTask:
+    """Generate the scenes of a seed under the folder of the run, or read those that are there."""
+    from manyeyes.training.pose.candidate_scenes import LabelledCandidates, build_scenes
+    from manyeyes.training.pose.candidate_verifier import CandidateVerifierTask
+
+    row, parts = bars.add_task("Generating scenes", total=config.num_scenes), list[LabelledCandidates]()
+    for part in build_scenes(out / f"scenes-{options.seed}", options.seed, config.num_scenes):
+        parts.append(part)
+        bars.update(row, advance=len(part.exists))
+    return CandidateVerifierTask(config, LabelledCandidates.cat(parts), options.seed)
 
 
 def _make_map_task(options: Options, config: MapTrainConfig, recording: Recording) -> MapTask:

@@ -19,13 +19,15 @@ from manyeyes.models.detector.fold_norms import fold_norms
 from manyeyes.models.detector.protocols import BoxDetector, check_detector
 from manyeyes.models.maps.map_model import MapModel, MapModelConfig
 from manyeyes.models.maps.presets import FORMAT
-from manyeyes.models.pose import feakm
+from manyeyes.models.pose import candidate_verifier, feakm
 from manyeyes.models.token_peaks import read_token_peaks
 from manyeyes.ops._sparse_conv_kernels import HAS_BFLOAT16
 
 DEFAULT_DETECTOR = "costr-small"
 DEFAULT_FEAKM = "feakm-small"
 """The shipped FeaKM network. It is not a detector, so list_detectors leaves it out."""
+DEFAULT_POSE_VERIFIER = "pose-verifier-small"
+"""The shipped verifier of candidate poses; no detector either."""
 DEFAULT_MAP_MODEL = "map-small-lidar"
 """The map model for LiDAR; map-small-camera and map-small-fusion take images, or both."""
 BFLOAT16_VARIABLE = "MANYEYES_BFLOAT16"
@@ -49,7 +51,8 @@ def list_map_models() -> tuple[str, ...]:
 
 
 def _shipped_detectors() -> tuple[str, ...]:
-    return tuple(name for name in _shipped() if name != DEFAULT_FEAKM and not name.startswith(_MAP_PREFIX))
+    others = (DEFAULT_FEAKM, DEFAULT_POSE_VERIFIER)
+    return tuple(name for name in _shipped() if name not in others and not name.startswith(_MAP_PREFIX))
 
 
 def _shipped() -> tuple[str, ...]:
@@ -101,6 +104,14 @@ def load_feakm(name_or_path: str | Path = DEFAULT_FEAKM) -> feakm.FeakmNet:
     """Load FeaKM's network: the shipped one by name, or a .safetensors file of 'manyeyes train --preset feakm-small'."""
     with _weights_file(name_or_path, tuple(name for name in _shipped() if name == DEFAULT_FEAKM)) as path:
         return feakm.load(path)
+
+
+def load_pose_verifier(name_or_path: str | Path = DEFAULT_POSE_VERIFIER) -> candidate_verifier.CandidateVerifier:
+    """Load a verifier of candidate poses: the shipped one by name, or a .safetensors file of 'manyeyes train --preset
+    pose-verifier-small'.
+    """
+    with _weights_file(name_or_path, tuple(name for name in _shipped() if name == DEFAULT_POSE_VERIFIER)) as path:
+        return candidate_verifier.load(path)
 
 
 def load_map_model(name_or_path: str | Path = DEFAULT_MAP_MODEL) -> MapModel:

@@ -95,4 +95,6 @@ def _load_fingerprint(path: Path) -> str:
         return pretrained.load_map_model(path).fingerprint.hex()
     if path.stem == pretrained.DEFAULT_FEAKM:
         return checkpoint.fingerprint(pretrained.load_feakm(path)).hex()
+    if path.stem == pretrained.DEFAULT_POSE_VERIFIER:
+        return checkpoint.fingerprint(pretrained.load_pose_verifier(path)).hex()
     return checkpoint.load(path).fingerprint.hex()

@@ -127,7 +127,7 @@ def rank_candidates(found: list[Candidate], prior: PosePrior | None, prior_volum
     """Rank candidates by score plus the log density ratio of the prior."""
     if not found:
         return None
-    scores = [c.score + ratio for c, ratio in zip(found, _prior_log_ratios(found, prior, prior_volume))]
+    scores = [c.score + ratio for c, ratio in zip(found, prior_log_ratios(found, prior, prior_volume))]
     order = sorted(range(len(found)), key=lambda n: (-scores[n], n))
     first = order[0]
     if len(order) == 1:
@@ -144,7 +144,7 @@ def decide(
     if ranked is None:
         return no_estimate(prior)
     best = ranked.best
-    prior_agrees = _prior_log_ratios([best], prior, acceptance.prior_volume)[0] > 0
+    prior_agrees = prior_log_ratios([best], prior, acceptance.prior_volume)[0] > 0
     is_conflict = prior is not None and mahalanobis_squared(best.pose, best.covariance, prior) > CHI2_3DOF_P001
     extra_margin = acceptance.conflict_margin if is_conflict else 0.0
     min_score = acceptance.required_score(best.num_compared, num_instants) + extra_margin
@@ -203,8 +203,8 @@ def mahalanobis_squared(pose: Floats, covariance: Floats, prior: PosePrior) -> f
     return float(delta @ np.linalg.solve(covariance + prior.covariance, delta))
 
 
-def _prior_log_ratios(candidates: list[Candidate], prior: PosePrior | None, prior_volume: float) -> list[float]:
-    """Log density of each pose under the prior, over that of a uniform pose; never negative."""
+def prior_log_ratios(candidates: list[Candidate], prior: PosePrior | None, prior_volume: float) -> list[float]:
+    """Return the log density of each pose under the prior, over that of a uniform pose; never negative."""
     if prior is None:
         return [0.0] * len(candidates)
     spread = np.array([c.covariance for c in candidates]) + prior.covariance

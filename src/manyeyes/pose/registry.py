@@ -37,6 +37,7 @@ POSE_CORRECTORS: Registry[RegisteredCorrector] = Registry(
     "manyeyes.pose.corrector",
     "manyeyes.pose.registration",
     "manyeyes.pose.feakm",
+    "manyeyes.pose.learned_voting",
     "manyeyes.pose.baselines",
 )
 

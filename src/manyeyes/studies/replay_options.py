@@ -47,8 +47,8 @@ class ReplayOptions:
     """Send request maps with token messages, and weight tokens by the latest received ones (Where2comm)."""
     pose_correction: str | None = None
     """Correct the poses of senders before fusion, by objects that both agents detect; leave out messages without a usable pose.
-    Corrector: voting, feakm, a .safetensors file of FeaKM, or a baseline: identity, coalign, fpv-rcnn, feaco, icp, vips,
-    clipper, max-clique, v2x-reg-odist, v2x-reg-oiou, mash."""
+    Corrector: voting, learned-voting, feakm, a .safetensors file of FeaKM, or a baseline: identity, coalign, fpv-rcnn, feaco, icp,
+    vips, clipper, max-clique, v2x-reg-odist, v2x-reg-oiou, mash."""
     misbehaviour: str | None = None
     """Weigh senders by trust: ray-evidence, or a baseline: none, oracle, robosac, cp-guard; a name of your own too."""
 

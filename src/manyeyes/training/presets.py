@@ -7,6 +7,7 @@ from manyeyes.training.detector.fusion_presets import FUSION_PLANS, FUSION_TRAIN
 from manyeyes.training.detector.plan import TrainPlan
 from manyeyes.training.detector.presets import DETECTOR_PLANS, DETECTOR_TRAINING_PRESETS
 from manyeyes.training.maps.presets import MAP_TRAINING_PRESETS
+from manyeyes.training.pose.candidate_verifier import CANDIDATE_VERIFIER_TRAINING_PRESETS
 from manyeyes.training.pose.feakm import FEAKM_TRAINING_PRESETS
 from manyeyes.training.trainer import TrainConfig
 
@@ -14,6 +15,7 @@ TRAINING_PRESETS: dict[str, TrainConfig] = {
     **DETECTOR_TRAINING_PRESETS,
     **FUSION_TRAINING_PRESETS,
     **FEAKM_TRAINING_PRESETS,
+    **CANDIDATE_VERIFIER_TRAINING_PRESETS,
     **MAP_TRAINING_PRESETS,
 }
 

@@ -174,6 +174,27 @@ def _make_risk_coverage(results: Sequence[StoredResult]) -> list[Panel]:
     return [make_panel(kind) for kind in dict.fromkeys(row["kind"] for row in rows)]
 
 
+def _make_acceptance_roc(results: Sequence[StoredResult]) -> list[Panel]:
+    rows = [row for stored in results for row in stored.result["roc"]]
+    numbers = list(dict.fromkeys(row["num_common"] for row in rows))
+
+    def make_panel(boxes: str) -> Panel:
+        def draw(axes: Any, theme: Theme) -> None:
+            for row in (r for r in rows if r["boxes"] == boxes):
+                is_vote = row["score"] == "voting"
+                label = f"{row['num_common']} common, {row['score']}"
+                colour = theme.series_colour(numbers.index(row["num_common"]))
+                axes.plot(
+                    row["null_rate"], row["success"], color=colour, ls="--" if is_vote else "-", lw=1.6, label=label
+                )
+            axes.set_xscale("log")
+            axes.set_ylim(0.0, 1.0)
+
+        return Panel(f"{boxes} boxes", "null pairs answered wrongly", "true pairs within 1 m and 1°", draw)
+
+    return [make_panel(boxes) for boxes in dict.fromkeys(row["boxes"] for row in rows)]
+
+
 def _make_pose_noise(results: Sequence[StoredResult]) -> list[Panel]:
     rows = [
         row
@@ -332,6 +353,11 @@ FIGURES = {
         "Risk against coverage of pose correctors without a prior",
         "manyeyes study pose-estimation --data data/carla-towns-small --split val",
         _make_risk_coverage,
+    ),
+    "acceptance-roc": StoredFigure(
+        "True pairs that are answered right against null pairs that are answered wrongly",
+        "python -m benchmarks.pose_verifier",
+        _make_acceptance_roc,
     ),
     "pose-noise": StoredFigure(
         "Pose correctors against the noise of the prior pose",

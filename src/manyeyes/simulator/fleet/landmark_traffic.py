@@ -8,6 +8,7 @@ traffic.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -95,13 +96,18 @@ def place_roadside_unit(rng: np.random.Generator) -> Floats:
     return np.array([*corner, rng.uniform(-np.pi, np.pi)])
 
 
-def make_later_traffic(earlier: Traffic, rng: np.random.Generator, parked_fraction: float) -> Traffic:
+def make_later_traffic(
+    earlier: Traffic,
+    rng: np.random.Generator,
+    parked_fraction: float,
+    make: Callable[[np.random.Generator], Traffic] = make_traffic,
+) -> Traffic:
     """Return the traffic at the same crossing minutes later: other vehicles in the same lanes and bays.
 
-    parked_fraction: of the parked vehicles that are still there.
+    parked_fraction: of the parked vehicles that are still there. make: draws traffic in these streets.
     """
     stays = (earlier.speed == 0) & (rng.random(len(earlier.pose)) < parked_fraction)
-    new = make_traffic(rng)
+    new = make(rng)
     apart = np.hypot(*(new.pose[:, None, :2] - earlier.pose[None, stays, :2]).transpose(2, 0, 1))
     is_free = (apart > _MIN_DISTANCE_M).all(1)
     parts = ((earlier, stays), (new, is_free))

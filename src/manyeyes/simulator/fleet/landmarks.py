@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -36,6 +37,7 @@ from manyeyes.simulator.fleet.landmark_traffic import (
     relative_pose,
     to_frame,
 )
+from manyeyes.simulator.fleet.street_layouts import StreetLayout, make_street_traffic, place_beside_road, place_in_lane
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -71,7 +73,8 @@ class LandmarkSpec:
     objects that only one observes. disjoint: the other agent stands at another crossing. num_instants: number of instants,
     period_s apart, the last is now. parked_fraction: where it is given, the other agent observes the crossing minutes later, with
     this fraction of the parked vehicles still there. body_offset_m: where it is given, both agents are vehicles that observe each
-    other, and their middles are so far ahead of the origins of their frames; bodies are not counted in num_common.
+    other, and their middles are so far ahead of the origins of their frames; bodies are not counted in num_common. layout: of the
+    streets, and other_layout where the other agent is elsewhere; None: the crossing of landmark_traffic.py.
     """
 
     num_common: int | None = None
@@ -85,6 +88,8 @@ class LandmarkSpec:
     clutter: SensorClutter = SensorClutter()
     placement: Placement = "roadside"
     body_offset_m: float | None = None
+    layout: StreetLayout | None = None
+    other_layout: StreetLayout | None = None
 
     def __post_init__(self) -> None:
         if min(self.num_ego_only, self.num_other_only, self.num_common or 0) < 0 or self.num_instants < 1:
@@ -120,16 +125,17 @@ class LandmarkScene:
 def make_landmark_scene(spec: LandmarkSpec, seed: int, scene: int) -> LandmarkScene:
     """Make one scene, a pure function of the specification, the seed and the number of the scene."""
     rng = keyed_generator(seed, "landmark scene", scene)
-    here = make_traffic(rng)
-    there = make_traffic(rng) if spec.disjoint else here
+    here = _make_traffic(spec.layout, rng)
+    there = _make_traffic(spec.other_layout, rng) if spec.disjoint else here
     num_common = int(rng.choice(len(DAIR_COMMON), p=np.array(DAIR_COMMON) / sum(DAIR_COMMON)))
     num_common = num_common if spec.num_common is None else spec.num_common
-    ego_now, ego_speed = place_vehicle(rng)
-    unit = place_roadside_unit(rng)
+    ego_now, ego_speed = place_vehicle(rng) if spec.layout is None else place_in_lane(spec.layout, rng)
+    unit_layout = spec.other_layout if spec.disjoint else spec.layout
+    unit = place_roadside_unit(rng) if unit_layout is None else place_beside_road(unit_layout, rng)
     # Draws of their own, so that they leave the scenes of simpler specifications as they are.
     extra_rng = keyed_generator(seed, "landmark extras", scene)
     if spec.parked_fraction is not None:
-        there = make_later_traffic(here, extra_rng, spec.parked_fraction)
+        there = make_later_traffic(here, extra_rng, spec.parked_fraction, partial(_make_traffic, spec.layout))
     if spec.placement != "roadside":
         unit = place_vehicle_near(ego_now, spec.placement, extra_rng)
     observers = _Observer(spec, here, extra_rng), _Observer(spec, there, extra_rng)
@@ -162,6 +168,10 @@ def make_landmark_scene(spec: LandmarkSpec, seed: int, scene: int) -> LandmarkSc
         now_xy,
         None if spec.body_offset_m is None else AgentBody.standing(spec.body_offset_m, 0.0, _BODY_SIZE_M),
     )
+
+
+def _make_traffic(layout: StreetLayout | None, rng: np.random.Generator) -> Traffic:
+    return make_traffic(rng) if layout is None else make_street_traffic(layout, rng)
 
 
 class _Observer:
