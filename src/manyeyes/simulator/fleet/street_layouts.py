@@ -48,7 +48,7 @@ class StreetLayout:
 
 
 def draw_layout(rng: np.random.Generator) -> StreetLayout:
-    """Draw a layout."""
+    """Draw a layout of streets."""
     return StreetLayout(
         num_roads=1 if rng.random() < 0.2 else 2,
         lanes=int(rng.integers(1, 4)),

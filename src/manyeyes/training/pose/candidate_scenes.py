@@ -47,7 +47,7 @@ class LabelledCandidates:
 
     @classmethod
     def cat(cls, many: Sequence[LabelledCandidates]) -> LabelledCandidates:
-        """Concatenate scenes."""
+        """Concatenate several sets of scenes."""
         return cls(*(np.concatenate([getattr(m, f.name) for m in many]) for f in fields(cls)))
 
 
@@ -61,7 +61,7 @@ def draw_spec(rng: np.random.Generator) -> LandmarkSpec:
     layout = draw_layout(rng) if rng.random() < 0.8 else None
     placement: Placement = "near" if rng.random() < 0.2 else "roadside"
     if kind < 0.33:
-        # As many boxes as where some are in common, so that their number says nothing.
+        # As many boxes as where some are in common, so that their number is no evidence.
         numbers = ego + common, other + common
         elsewhere = layout if rng.random() < 0.3 else draw_layout(rng)
         return LandmarkSpec(0, *numbers, noise, True, clutter=clutter, layout=layout, other_layout=elsewhere)
