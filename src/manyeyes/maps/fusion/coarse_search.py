@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from manyeyes._jit import Boolx1, F32x3, F64x1, F64x2, I64x1, njit
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays
@@ -158,7 +158,7 @@ def find_isolated_shifts(
     drive = np.unique(np.array(drives), return_inverse=True)[1]
     place = np.concatenate((xy, 4.0 * radius_m * drive[:, None]), 1)
     total, shifted = (
-        cKDTree(place[rows]).query_ball_point(place, radius_m, return_length=True)
+        KDTree(place[rows]).query_ball_point(place, radius_m, return_length=True)
         for rows in (np.arange(len(place)), np.flatnonzero(is_shifted))
     )
     return is_shifted & (2 * np.asarray(shifted) <= np.asarray(total))
