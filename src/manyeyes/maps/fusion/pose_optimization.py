@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from manyeyes.maps.elements.observation import Observation
 from manyeyes.maps.fusion.coarse_search import search_coarse
+from manyeyes.maps.fusion.existence import POINT_VARIANCE_M2
 from manyeyes.maps.fusion.joint_solver import (
     AgentLimits,
     JointPriors,
@@ -264,7 +265,9 @@ def _estimate_scale(whole: PoseSolution, pairs: PairSums) -> Floats:
     """Estimate the residual scale (O,) of each observation's agent in metres."""
     agent = np.unique(np.array(whole.agents), return_inverse=True)[1]
     # A prior of 20 points keeps the scale of an agent without matches at 0.2 m.
-    variance = (np.bincount(agent, pairs.own[:, 9]) + 20.0 * 0.04) / (np.bincount(agent, pairs.own[:, 10]) + 20.0)
+    variance = (np.bincount(agent, pairs.own[:, 9]) + 20.0 * POINT_VARIANCE_M2) / (
+        np.bincount(agent, pairs.own[:, 10]) + 20.0
+    )
     return np.sqrt(variance)[agent]
 
 
