@@ -29,6 +29,19 @@ def test_stations_in_a_row_are_one_line_and_rows_a_lane_apart_are_two():
     assert count_chains([(0.0, 30.0, 0.0), (31.0, 60.0, 3.5)]) == 2
 
 
+@pytest.mark.parametrize(
+    ("neighbour", "chains"),
+    [
+        ([(0.0, 80.0, 3.5)], 2),
+        ([(0.0, 30.0, 3.5), (50.0, 80.0, 3.5)], 4),
+        ([(0.0, 30.0, 9.0), (50.0, 80.0, 9.0)], 2),
+    ],
+    ids=["the neighbour runs on", "it ends, too", "no neighbour is near"],
+)
+def test_a_line_is_not_joined_across_ground_where_its_neighbours_end_too(neighbour, chains):
+    assert count_chains([(0.0, 30.0, 0.0), (50.0, 80.0, 0.0), *neighbour], 3.0) == chains
+
+
 @pytest.mark.parametrize("gap, coverage, dashed, lines", [
     (8.0, 99.0, False, 1),
     (10.0, 99.0, False, 2),  # high coverage without a detection

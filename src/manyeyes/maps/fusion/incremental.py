@@ -25,6 +25,7 @@ from manyeyes.maps.fusion.coarse_search import DrawnPoints, apply_shifts, find_b
 from manyeyes.maps.fusion.coverage import find_cells_under_lines, find_observed_cells, merge_runs
 from manyeyes.maps.fusion.crossings import compute_convex_hull, compute_overlap
 from manyeyes.maps.fusion.existence import (
+    POINT_VARIANCE_M2,
     EvidenceConfig,
     EvidenceParameters,
     EvidenceTable,
@@ -114,7 +115,7 @@ class IncrementalMap:
         self._observation_ids.append(raw)
         self._observed_cells.append(find_observed_cells(s, pose))
         xy, tangent = s.to_world(pose)
-        weight = 0.04 / (s.sigma**2 + 0.1**2 + covariance[0, 0, 0] / 2 + covariance[0, 1, 1] / 2)
+        weight = POINT_VARIANCE_M2 / (s.sigma**2 + 0.1**2 + covariance[0, 0, 0] / 2 + covariance[0, 1, 1] / 2)
         score_weight = self.config.fusion.stations.evidence.score_weight(s.elements.score)[s.element_of_point]
         confirmed, missed, explained = 0, 0, np.zeros(len(xy), bool)
         placed = _PlacedObservation.of(
@@ -514,7 +515,7 @@ class _StationGrid:
         )
         hit = mass > 0.0
         rows = near[hit]
-        gain = mass[hit] / (mass[hit] + 1.0 / np.maximum(self.rows.evidence.sigma[rows], 0.02) ** 2 * 0.04)
+        gain = mass[hit] / (mass[hit] + 1.0 / np.maximum(self.rows.evidence.sigma[rows], 0.02) ** 2 * POINT_VARIANCE_M2)
         self.rows.add_log_odds(rows, evidence.log_odds_hit(bool(s.trusted[0])) * score_weight[hit], s, True, config)
         normal = np.stack((-self.tangent[rows, 1], self.tangent[rows, 0]), 1)
         self.xy[rows] += (gain * place[hit])[:, None] * normal

@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx2, F64x1, F64x2, I64x1, I64x2, I64x3, njit
-from manyeyes.maps.fusion.point_grid import build_grid, find_cell_range, line_residual
+from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, find_cell_range, line_residual
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
+_GUIDE_CELL_M = 2.5
+_INWARD_M = 3.0  # from an end into the line, where neighbours are searched
 # Sides of a station, by its own tangent.
 _FRONT, _BEHIND = 0, 1
 
@@ -32,7 +34,8 @@ class LinkConfig:
     max_gap_m: largest gap between linked stations; max_join_gap_m: between line ends in the second round.
     max_dashed_gap_m: between ends of dashed lines.
     max_low_coverage_gap_m: between ends whose summed visibility is at most max_coverage, where missing a line by chance is
-        plausible.
+        plausible. Gaps longer than max_join_gap_m are not joined where a line runs beside their ends, at most max_guide_m
+        away, and none beside their middle: where all lines end, a junction begins.
     max_lateral_m, lateral_slope: largest lateral gap between linked stations at no gap, and its growth per metre.
     max_end_lateral_m, end_lateral_slope: the same between line ends, which have fewer detections and so more scatter.
     max_heading_rad, heading_slope: largest turn at no gap, and its growth per metre.
@@ -45,7 +48,8 @@ class LinkConfig:
     max_join_gap_m: float = 8.0
     max_dashed_gap_m: float = 12.0
     max_low_coverage_gap_m: float = 24.0
-    max_coverage: float = 12.0
+    max_coverage: float = 6.0
+    max_guide_m: float = 5.0
     max_lateral_m: float = 0.25
     lateral_slope: float = 0.08
     max_end_lateral_m: float = 0.8
@@ -91,7 +95,13 @@ def link_stations(
         ends = np.unique(np.concatenate((members[offsets[:-1]], members[offsets[1:] - 1])))
         ends = ends[allowed[ends]]
         direction = _end_tangents(xy, tangent, offsets, members)
-        pair = _join_ends(pair, ends, xy, direction, kind, max_gap, gates)
+        joined = _join_ends(pair, ends, xy, direction, kind, max_gap, gates)
+        if gates is far:
+            guides = build_grid(xy[:, 0], xy[:, 1], np.zeros(len(xy), np.int64), _GUIDE_CELL_M)
+            joined = _drop_across_junctions(
+                pair, joined, xy, tangent, guides, (config.max_join_gap_m, config.max_guide_m)
+            )
+        pair = joined
         offsets, members = _trace_chains(pair, log_odds)
     return offsets, members
 
@@ -180,6 +190,56 @@ def _find_best_partners(
                     cost[side] = value
                     best[k, side, 0], best[k, side, 1] = q, back
     return best
+
+
+@njit(cache=True, nogil=True)
+def _drop_across_junctions(
+    pair: I64x2, joined: I64x2, xy: F64x2, tangent: F64x2, grid: PointGrid, limits: tuple[float, float]
+) -> I64x2:  # pragma: no cover - compiled
+    """Return joined (K, 2) without those links, new since pair, over gaps beside which the other lines end, too.
+
+    grid: of all stations. limits: gaps up to the first (m) stay; other lines are at most the second (m) aside.
+    """
+    min_gap, max_guide = limits
+    out = joined.copy()
+    for k in range(len(pair)):
+        for side in range(2):
+            q = joined[k, side]
+            if q < 0 or q == pair[k, side]:
+                continue
+            dx, dy = xy[q, 0] - xy[k, 0], xy[q, 1] - xy[k, 1]
+            gap = np.hypot(dx, dy)
+            if gap <= min_gap:
+                continue
+            u, v = dx / gap, dy / gap
+            inward, middle = _INWARD_M / gap, 0.5
+            before, after = -inward, 1.0 + inward
+            has_neighbour = _is_accompanied(
+                xy[k, 0] + before * dx, xy[k, 1] + before * dy, u, v, xy, tangent, grid, max_guide
+            ) or _is_accompanied(xy[k, 0] + after * dx, xy[k, 1] + after * dy, u, v, xy, tangent, grid, max_guide)
+            if has_neighbour and not _is_accompanied(
+                xy[k, 0] + middle * dx, xy[k, 1] + middle * dy, u, v, xy, tangent, grid, max_guide
+            ):
+                out[k, side] = -1
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _is_accompanied(
+    x: float, y: float, u: float, v: float, xy: F64x2, tangent: F64x2, grid: PointGrid, max_guide: float
+) -> bool:  # pragma: no cover - compiled
+    """Return whether a station of another line in direction u, v lies beside a place, 1 m to max_guide aside."""
+    wide = int(np.ceil(max_guide / _GUIDE_CELL_M)) + 1
+    ix, iy = int(np.floor(x / _GUIDE_CELL_M)), int(np.floor(y / _GUIDE_CELL_M))
+    for cell in range(-wide, wide + 1):
+        low, high = find_cell_range(grid.keys, grid.offsets, 0, ix + cell, iy - wide, iy + wide)
+        for place in range(low, high):
+            g = grid.order[place]
+            ex, ey = xy[g, 0] - x, xy[g, 1] - y
+            is_beside = abs(ex * u + ey * v) < 2.0 and 1.0 < abs(ey * u - ex * v) < max_guide
+            if is_beside and abs(u * tangent[g, 0] + v * tangent[g, 1]) > 0.95:
+                return True
+    return False
 
 
 @njit(cache=True, nogil=True)
