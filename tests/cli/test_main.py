@@ -105,6 +105,7 @@ def test_doctor_prints_json_for_a_bug_report(capsys) -> None:
         "map",
         "view",
         "av2",
+        "cloud",
         "dask",
         "ray",
         "icp",

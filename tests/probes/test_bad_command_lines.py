@@ -115,6 +115,8 @@ study bandwidth --data {{rec}} --budgets 64 nan | --budgets
 study fusion --seeds 0 | --seeds
 study fusion --observation-counts 0 | --observation-counts
 study adversarial --seeds -1 | --seeds
+study malicious-agents --fractions 1.5 | --fractions
+study malicious-agents --offsets-m -1 | --offsets-m
 study crowdmap-table3 --workers 0 | --workers
 study num-agents --data {{rec}} --seed -1 | --seed
 study sensors --data {{rec}} --seed -1 | --seed
@@ -182,6 +184,7 @@ study fusion --methods nosuch | nosuch
 study fusion --places nowhere | nowhere
 study fleet-pose-noise --places nowhere | nowhere
 study adversarial --places nowhere | nowhere
+study malicious-agents --places nowhere | nowhere
 study tuning --methods nosuch | nosuch
 study map-pose-noise --data {rec} --split test --pose-correction nosuch | nosuch
 study full-map --data {rec} --split test --methods nosuch | nosuch

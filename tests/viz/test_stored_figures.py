@@ -83,6 +83,14 @@ RESULTS: dict[str, dict[str, Any]] = {
     "map-observations": {
         "summaries": [{"group": f"{n} observations", "method": "union", "mean_ap": interval(0.4)} for n in (20, 60)]
     },
+    "acceptance-roc": {
+        "roc": [
+            {
+                "boxes": "15 x 17", "num_common": 3, "score": score, "null_rate": [0.001, 0.01, 0.1], "success": [0.1, 0.2, top],
+            }
+            for score, top in (("voting", 0.5), ("learned", 0.8))
+        ]
+    },
     "latency-stack": {
         "rows": [
             {"case": "16 beams", "weights": "w", "drive": 0, "agents": 4, "present_stages_ms": {"share: a": 1.0}}

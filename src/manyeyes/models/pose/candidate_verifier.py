@@ -40,8 +40,8 @@ class CandidateVerifier(nn.Module):
     def __init__(self, config: CandidateVerifierConfig) -> None:
         super().__init__()
         self.config = config
-        self.register_buffer("mean", torch.zeros(NUM_FEATURES))
-        self.register_buffer("scale", torch.ones(NUM_FEATURES))
+        self.register_buffer("mean", torch.zeros(NUM_FEATURES, device="cpu"))
+        self.register_buffer("scale", torch.ones(NUM_FEATURES, device="cpu"))
         width = config.hidden
         self.net = nn.Sequential(
             nn.Linear(NUM_FEATURES, width),
