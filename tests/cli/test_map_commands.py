@@ -96,6 +96,17 @@ def test_export_writes_a_file_that_others_read(folder, tmp_path) -> None:
     assert len(json.loads((tmp_path / "all.geojson").read_text())["features"]) >= len(held["features"])
 
 
+def test_a_map_of_one_agent_states_why_nothing_is_published(folder, tmp_path, capsys) -> None:
+    assert run("map", "simulate", "cross", "--observations", 1, "--size", 150, "--out", tmp_path) == 0
+    assert run("map", "fuse", tmp_path) == 0
+    assert len(read_vector_map(tmp_path / "map")) > 0 and "No element is published" in capsys.readouterr().out
+    assert run("map", "export", tmp_path / "map", tmp_path / "none.geojson") == 0
+    assert "--trusted" in capsys.readouterr().out
+    assert run("map", "export", tmp_path / "map", tmp_path / "all.geojson", "--include-unpublished") == 0
+    assert run("map", "export", folder / "map", tmp_path / "map.geojson") == 0
+    assert "No element is published" not in capsys.readouterr().out
+
+
 @pytest.mark.slow
 def test_a_store_takes_observations_and_other_commands_read_its_last_release(folder, tmp_path, capsys) -> None:
     store = tmp_path / "city"

@@ -89,6 +89,17 @@ def load_observations(path: Path, console: Console) -> LoadedObservations:
     return loaded
 
 
+def print_none_published(num_published: int, num_elements: int, console: Console) -> None:
+    """Print why a map with elements has none that is published, and the remedy; nothing otherwise."""
+    if num_elements and not num_published:
+        console.print(
+            "No element is published: that takes detections by two agents, or a trusted observation ('manyeyes map import "
+            "--trusted'). 'manyeyes map export --include-unpublished' writes candidates, too.",
+            highlight=False,
+            soft_wrap=True,
+        )
+
+
 def report_rejected(rejected: Sequence[RejectedRows], console: Console) -> None:
     """What could not be used, and why, one line each."""
     for rows in rejected:

@@ -34,10 +34,12 @@ def main(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes.maps.formats.export import export_map
-    from manyeyes.studies.map_folder import read_vector_map
+    from manyeyes.studies.map_folder import print_none_published, read_vector_map
 
     vector_map = read_vector_map(options.folder)
     selected = vector_map if options.include_unpublished else vector_map.select_published()
     options.file.parent.mkdir(parents=True, exist_ok=True)
     export_map(selected, options.file, options.format, options.simplify_m, options.crs)
-    Console().print(f"{options.file}: {len(selected)} elements", highlight=False, soft_wrap=True)
+    console = Console()
+    console.print(f"{options.file}: {len(selected)} elements", highlight=False, soft_wrap=True)
+    print_none_published(len(selected), len(vector_map), console)

@@ -74,7 +74,7 @@ def _fuse_into_folder(
     from manyeyes.maps.isolation import reject_failed
     from manyeyes.maps.registry import fuse_isolated
     from manyeyes.studies import provenance
-    from manyeyes.studies.map_folder import GROUND_FILE, report_rejected, write_vector_map
+    from manyeyes.studies.map_folder import GROUND_FILE, print_none_published, report_rejected, write_vector_map
 
     start = time.perf_counter()
     with console.status(f"Fusing {len(loaded.observations)} observations"):
@@ -104,6 +104,7 @@ def _fuse_into_folder(
         highlight=False,
         soft_wrap=True,
     )
+    print_none_published(published, len(fused), console)
 
 
 def _fuse_into_store(options: Options, place: str, console: Console) -> None:
