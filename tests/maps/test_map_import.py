@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps of other programs as observations: their place on earth, what is left out, and two of them merged."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -240,3 +241,12 @@ def test_an_argoverse_2_form_without_a_city_needs_an_origin(two_lanes, tmp_path)
     assert furthest(read.elements.take(read.elements.kind == DIVIDER).points, m.elements) < 0.03
     xy = metres_from_degrees(48.137, 11.575, (48.137, 11.575))
     np.testing.assert_allclose(xy, 0.0, atol=1e-9)
+
+
+def test_maps_of_two_regions_are_refused_by_the_name_of_the_second(two_lanes, tmp_path, capsys):
+    for name, frame in (("karlsruhe", MapFrame(49.0, 8.4)), ("pittsburgh", MapFrame(40.4, -80.0))):
+        export_map(replace(two_lanes(), frame=frame), tmp_path / f"{name}.geojson")
+    files = [tmp_path / f"{name}.geojson" for name in ("karlsruhe", "pittsburgh")]
+    assert cli.main(["map", "import", *map(str, files), "--out", str(tmp_path / "out")]) == 1
+    text = " ".join(capsys.readouterr().err.split())
+    assert "pittsburgh.geojson: lies 6," in text and "one region" in text and not list(tmp_path.rglob("*.parquet"))

@@ -13,6 +13,8 @@ from manyeyes._bounds import AngleDeg, Fraction, LatitudeDeg, LengthM, Longitude
 from manyeyes.datatypes import ConfigError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
     from rich.console import Console
 
     from manyeyes.maps.elements.observation_file import LoadedObservations
@@ -135,6 +137,7 @@ def _read_maps(options: Options) -> LoadedObservations:
     for path, name in zip(options.sources, names):
         source_map = read_source_map(path, frame, choice.crs)
         frame = source_map.frame
+        _check_distance(path, source_map.elements.points)
         source = MapSource(
             agent=name,
             time_ns=_find_time(path, choice.date),
@@ -148,6 +151,18 @@ def _read_maps(options: Options) -> LoadedObservations:
         left_out.update({f"{path.name}: {what}": count for what, count in source_map.left_out.items()})
     assert frame is not None
     return LoadedObservations(frame, tuple(observations), (), dict(left_out))
+
+
+def _check_distance(path: Path, points: NDArray[np.float64]) -> None:
+    """ConfigError for a map of points (P, 2) beyond the limit of positions; metres from the frame's origin."""
+    from manyeyes.maps.elements.observation_limits import LIMITS
+
+    reach = float(abs(points).max(initial=0.0))
+    if not reach <= LIMITS.max_position_m:
+        raise ConfigError(
+            f"{path}: lies {reach / 1e3:,.0f} km from the origin of the maps, at most {LIMITS.max_position_m / 1e3:,.0f} km are "
+            "possible. Import maps of one region at a time, or name --origin LATITUDE LONGITUDE in it."
+        )
 
 
 def _name_agents(sources: tuple[Path, ...]) -> list[str]:
