@@ -255,7 +255,14 @@ def test_robustness_is_perturbations_by_methods_of_one_form(tmp_path: Path) -> N
     assert tables["robustness-temporal-ap70"][1] == ("clean", "-") and len(tables) == 4
 
 
-@pytest.mark.parametrize("rows", [{"study": "byte-curves", "rows": []}, {"study": "fusion", "summaries": []}])
+@pytest.mark.parametrize(
+    "rows",
+    [
+        {"study": "byte-curves", "rows": []},
+        {"study": "fusion", "summaries": []},
+        {"study": "malicious-agents", "rows": []},
+    ],
+)
 def test_tables_that_a_study_printed_are_those_of_the_document(tmp_path: Path, rows: dict[str, Any]) -> None:
     printed = {"title": "AP against bytes, with memory", "headings": ["method", "AP"], "lines": [["late", "0.9"]]}
     result = {**rows, "tables": [printed]}

@@ -73,7 +73,7 @@ def _describe(found: RecordingCheck, missing: MissingFiles, summary: tuple[str, 
     yield from (str(problem) for problem in missing.files[:_MAX_LINES])
     yield from found.disorder[:_MAX_LINES]
     if not found.has_truth:
-        yield "no labels: it can be played and drawn, and neither evaluated nor trained on"
+        yield "no labels: view, pose, live and Python take it; replay, evaluate and train need labels"
     else:
         labels = ", ".join(f"{count} {label}" for label, count in sorted(found.num_boxes.items()))
         yield f"labels: {labels or 'no box'}"

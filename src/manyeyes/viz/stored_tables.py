@@ -117,7 +117,8 @@ def _has_no_recording(result: dict[str, Any]) -> bool:
 
 def _has_simulated_scenes(result: dict[str, Any]) -> bool:
     """Return whether a result is of the step, of the cost of maps or of a study of map fusion, which simulate what they need."""
-    return "costs" in result or "summaries" in result or "present_stages_ms" in (result.get("rows") or [{}])[0]
+    is_fleet = "summaries" in result or result.get("study") == "malicious-agents"
+    return is_fleet or "costs" in result or "present_stages_ms" in (result.get("rows") or [{}])[0]
 
 
 def make_tables(stored: StoredResult) -> tuple[StoredTable, ...]:

@@ -96,7 +96,8 @@ def select_ego_truth(snapshot: Snapshot, ego: int, protocol: DetectionProtocol) 
     truth = snapshot.truth
     if truth is None:
         raise RecordingError(
-            f"{snapshot.scenario} #{snapshot.index} has no truth; only recordings with labels are evaluated."
+            f"{snapshot.scenario} #{snapshot.index} has no truth; only recordings with labels are evaluated. "
+            "'manyeyes view' draws one without."
         )
     truth = truth.of_classes(protocol.classes)
     position = truth.world_from_agent.translation[:, :2]
