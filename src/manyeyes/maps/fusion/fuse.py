@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx1, I64x1, njit
-from manyeyes.datatypes.map_element import DASHED, STOP_LINE, MapElements, take_rows
+from manyeyes.datatypes.map_element import DASHED, MapElements, take_rows
 from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import (
     CANDIDATE,
@@ -29,7 +29,6 @@ from manyeyes.maps.elements.vector_map import (
 )
 from manyeyes.maps.fusion.coverage import cut_unobserved
 from manyeyes.maps.fusion.existence import EvidenceTable
-from manyeyes.maps.fusion.line_score import ChainPoints, LineScoreConfig, compute_line_score, describe_lines
 from manyeyes.maps.fusion.observation_arrays import to_observation_arrays
 from manyeyes.maps.fusion.parallel_extension import ParallelExtensionConfig, extend_parallel
 from manyeyes.maps.fusion.polyline_linking import LinkConfig, link_stations, smooth_chains
@@ -55,7 +54,7 @@ class MapFusionConfig:
 
     pose_solver, stations, link, parallel_extension, topology: of the steps.
     min_length_m: shortest line by kind (divider, boundary, crossing, stop line).
-    line_score: how lines are scored.
+    full_score_length_m: by kind, length from which a line's score is not lowered.
     """
 
     pose_solver: PoseSolverConfig = field(default_factory=PoseSolverConfig)
@@ -63,7 +62,7 @@ class MapFusionConfig:
     link: LinkConfig = field(default_factory=LinkConfig)
     parallel_extension: ParallelExtensionConfig = field(default_factory=ParallelExtensionConfig)
     min_length_m: tuple[float, float, float, float] = (2.0, 4.0, 0.0, 2.0)
-    line_score: LineScoreConfig = field(default_factory=LineScoreConfig)
+    full_score_length_m: tuple[float, float, float, float] = (20.0, 20.0, 0.0, 3.0)
 
 
 def fuse(
@@ -148,24 +147,18 @@ def _build_lines(table: StationTable, chosen: NDArray[np.bool_], config: MapFusi
     points, members = points[order], members[order]
     length = _lengths(offsets, points)
     line_kind = kind[members[offsets[:-1]]] if len(members) else np.zeros(0, np.int64)
-    score = _score_lines(table.line_evidence, rows[members], points, offsets, length, config.line_score)
+    mean = (
+        np.add.reduceat(table.line_evidence.log_odds[rows][members], offsets[:-1]) / np.diff(offsets)
+        if len(members)
+        else np.zeros(0)
+    )
+    share = np.minimum(1.0, length / np.array(config.full_score_length_m)[line_kind].clip(1e-9))
+    score = share / (1.0 + np.exp(-mean / 4.0))
     stays = np.flatnonzero(length >= np.array(config.min_length_m)[line_kind])
     kept_points, places = take_rows(offsets, stays)
     return _ElementParts(
         points[places], kept_points, rows[members[places]], members[places] < num_observed, score[stays]
     )
-
-
-def _score_lines(
-    evidence: EvidenceTable, own: Ints, points: Floats, offsets: Ints, length: Floats, config: LineScoreConfig
-) -> Floats:
-    """Score lines of points (M, 2), offsets (L + 1,) and length (L,); own: (M,) row of the evidence of each point."""
-    chains = ChainPoints(points, offsets, evidence.log_odds[own], evidence.sigma[own])
-    features = describe_lines(chains, length, config)
-    # A stop line is short and has no parallel neighbours: existence decides.
-    is_stop_line = evidence.kind[own[offsets[:-1]]] == STOP_LINE if len(own) else np.zeros(0, bool)
-    existence = 1.0 / (1.0 + np.exp(-features.log_odds / 4.0))
-    return np.where(is_stop_line, existence, compute_line_score(features, config))
 
 
 def _link_stations(
