@@ -204,10 +204,13 @@ def merge_solutions(
     """Merge the home observations of all tiles after a step (None: the first search), ids ascending; solve a joint step."""
     whole = PoseSolution.cat(parts)
     step = None if number is None else config.schedule[number]
-    if step is None or step.joint is None:
-        return _reset_isolated(whole, config)
-    if whole.pairs is None or not len(whole.ids):
+    if not len(whole.ids):
         return replace(whole, pairs=None)
+    if step is None or step.joint is None:
+        domains = list_domains(whole.prior_pose, config)
+        return PoseSolution.cat([settle_domain([whole], domain, config) for domain in domains])
+    if whole.pairs is None:
+        return whole
     states: list[PoseSolution] = []
     sums: list[AgentSums] = []
     rows, solved = np.zeros(0, np.int64), None
@@ -235,11 +238,12 @@ def settle_domain(
 ) -> PoseSolution:
     """Reset the observations of one domain that a search shifted alone of their drive; ids ascending.
 
-    parts: disjoint, which together hold all observations within the halo of the domain.
+    A pure function of the observations within the halo of the domain, which the disjoint parts together hold.
     """
     whole = PoseSolution.cat(parts)
-    home = np.flatnonzero((_domain_indices(whole.prior_pose, config) == domain).all(1))
-    return _reset_isolated(whole, config).take(home)
+    near = whole.take(_rows_near_domain(whole, domain, config))
+    home = np.flatnonzero((_domain_indices(near.prior_pose, config) == domain).all(1))
+    return _reset_isolated(near, config).take(home)
 
 
 def list_domains(prior_pose: Floats, config: PoseSolverConfig = DEFAULT_ALIGN) -> list[tuple[int, int]]:
