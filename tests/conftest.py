@@ -35,6 +35,14 @@ def device(request: pytest.FixtureRequest) -> Iterator[torch.device]:
         with emulate():
             yield DEVICE
     elif torch.cuda.is_available():
-        yield torch.device("cuda", 0)
+        # Convolutions of float32, as those that are compared with.
+        with torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+            yield torch.device("cuda", 0)
     else:
         pytest.skip("needs a GPU; torch finds none")
+
+
+@pytest.fixture
+def is_gpu(request: pytest.FixtureRequest) -> bool:
+    """Whether the fixture device is a GPU, whose operators round otherwise than the CPU's, and not the emulated device."""
+    return request.node.callspec.params["device"] == "cuda"

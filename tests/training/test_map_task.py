@@ -339,20 +339,27 @@ def make_task(kind: str) -> MapTask:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["lidar", "camera"])
-def test_a_step_on_a_device_has_the_loss_and_the_weights_of_the_cpu(tmp_path, device, kind):
+def test_a_step_on_a_device_has_the_loss_and_the_weights_of_the_cpu(tmp_path, device, is_gpu, kind):
     ours, theirs = (Trainer(make_task(kind), tmp_path / str(i), d) for i, d in enumerate(("cpu", device)))
     begun = [p.detach().clone() for p in ours.model.parameters()]
     one, other = ours.advance(), theirs.advance()
     assert other.loss == pytest.approx(one.loss, rel=1e-5)
     assert other.terms == pytest.approx(one.terms, rel=1e-4, abs=1e-6)
     assert all(p.device == device for p in theirs.model.parameters())
+    # AdamW's first moment is then a tenth of the gradient.
+    grads = [
+        torch.cat([state["exp_avg"].cpu().flatten() for state in trainer.optimiser.state.values()])
+        for trainer in (ours, theirs)
+    ]
+    assert float((grads[0] - grads[1]).norm()) < 1e-3 * float(grads[0].norm())
     pairs = list(zip(begun, ours.model.parameters(), theirs.model.parameters(), strict=True))
     apart, moved = (
         math.sqrt(sum(float((a.detach().cpu() - b.detach().cpu()).square().sum()) for a, b in each))
         for each in ([(mine, its) for _, mine, its in pairs], [(was, mine) for was, mine, _ in pairs])
     )
-    # AdamW's first step is the sign of a gradient: rounding turns it where the gradient is nearly zero.
-    assert moved > 0 and apart < 0.02 * moved
+    # AdamW's first step is the sign of a gradient: rounding turns it where the gradient is nearly zero, which on a GPU is every
+    # weight whose exact gradient is zero.
+    assert moved > 0 and apart < (0.5 if is_gpu else 0.02) * moved
 
 
 @pytest.mark.slow

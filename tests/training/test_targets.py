@@ -171,11 +171,14 @@ def test_a_long_chain_of_boxes_is_matched_like_the_greedy_rule():
     assert match_pairs(site[:0], box[:0], 2, 0).tolist() == [-1, -1]
 
 
-def test_targets_of_another_device_are_those_of_the_cpu(device):
+def test_targets_of_another_device_are_those_of_the_cpu(device, is_gpu):
+    """Equal bit by bit where the operators are the CPU's; a GPU's exponential and logarithm round otherwise."""
     sites, truth, config = every(4, 3), crowded_truth(0), TargetConfig()
     there = sites.to(device)
     mine, its = assign_targets(sites, truth, config), assign_targets(there, truth, config)
     assert its.heat.device == its.boxes.center.device == device
-    for name in ("heat", "box", "weight", "positive"):
-        assert torch.equal(getattr(mine, name), getattr(its, name).cpu())
+    rtol, atol = (1e-5, 1e-6) if is_gpu else (0.0, 0.0)
+    for name in ("heat", "box", "weight"):
+        torch.testing.assert_close(getattr(its, name).cpu(), getattr(mine, name), rtol=rtol, atol=atol)
+    assert torch.equal(mine.positive, its.positive.cpu())
     assert torch.equal(find_nearby_objects(sites, truth, config), find_nearby_objects(there, truth, config).cpu())
