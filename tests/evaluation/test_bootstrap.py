@@ -9,9 +9,11 @@ import torch
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.detection.average_precision import PROTOCOLS, FrameMatch, compute_ap
 from manyeyes.evaluation.statistics.bootstrap import (
+    PooledMatches,
     bootstrap,
     draw_resamples,
     mean_interval,
+    weighted_ap,
     weighted_recall,
 )
 
@@ -128,3 +130,30 @@ def test_resamples_are_multinomial_and_pure():
     assert counts.shape == (2000, 7) and (counts.sum(1) == 7).all()
     assert np.abs(counts.mean(0) - 1).max() < 0.1 and counts.max() >= 4
     assert np.array_equal(counts, draw_resamples(7, 2000, 5))
+
+
+def plain_ap(pool: PooledMatches, weights: np.ndarray) -> float:
+    """AP of one resample, (S,) weights, as its curve defines it: whole arrays, one weight a detection."""
+    drawn = weights[pool.scenario_row].astype(float)
+    start = np.arange(len(drawn)) if pool.group_start is None else pool.group_start
+    weight, gain = (np.add.reduceat(values, start) for values in (drawn, drawn * pool.tp))
+    seen = np.cumsum(weight)
+    envelope = np.maximum.accumulate((np.cumsum(gain) / np.maximum(seen, 1))[::-1])[::-1]
+    if pool.drop_first_segment:
+        first = (seen == weight) & (weight > 0)
+        gain = gain - np.where(first, np.minimum(gain, 1) if pool.group_start is None else gain, 0)
+    return float((gain * envelope).sum() / (weights @ pool.n_gt))
+
+
+@pytest.mark.parametrize("drop_first", [False, True])
+@pytest.mark.parametrize("ties", ["none", "few", "all"])
+def test_compiled_resamples_are_the_curves_of_whole_arrays(ties, drop_first):
+    rng = np.random.default_rng(3)
+    tp, row = rng.random(300) < 0.6, rng.integers(7, size=300)
+    tp[:4] = True
+    start = {"none": None, "few": np.flatnonzero(np.arange(300) % 3 != 1), "all": np.zeros(1, np.int64)}[ties]
+    pool = PooledMatches(tuple("abcdefg"), tp, row, rng.integers(20, 60, size=7), drop_first, start)
+    weights = draw_resamples(7, 40, 0)
+    expected = [plain_ap(pool, each) for each in weights]
+    assert len(set(expected)) > 1 or (ties == "all" and drop_first)
+    np.testing.assert_allclose(weighted_ap(pool, weights), expected, rtol=1e-12)

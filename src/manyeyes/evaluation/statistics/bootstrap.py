@@ -26,12 +26,10 @@ from manyeyes.evaluation.detection.frame_match import (
     count_truth,
     rank_matches,
     sort_by_frame,
-    sum_groups,
 )
 from manyeyes.evaluation.detection.protocols import PROTOCOLS, DetectionProtocol
+from manyeyes.evaluation.statistics._resample_kernels import resample_ap
 from manyeyes.ops.keyed_random import keyed_uniform
-
-_CHUNK_ROWS = 4_000_000
 
 
 @dataclass(frozen=True)
@@ -70,23 +68,13 @@ Statistic = Callable[[PooledMatches, np.ndarray], np.ndarray]
 
 def weighted_ap(pool: PooledMatches, weights: np.ndarray) -> np.ndarray:
     """Return AP (R,) of each resample (R, S); NaN where it holds no truth. Weights of one give the plain AP."""
-    ap = np.full(len(weights), np.nan)
-    n_gt = weights @ pool.n_gt
-    step = max(1, _CHUNK_ROWS // max(1, len(pool.tp)))
-    for begin in range(0, len(weights), step):
-        rows = slice(begin, begin + step)
-        drawn = weights[rows][:, pool.scenario_row].astype(np.float64)
-        weight, gain = (sum_groups(values, pool.group_start) for values in (drawn, drawn * pool.tp))
-        seen = np.cumsum(weight, 1)
-        precision = np.cumsum(gain, 1) / np.maximum(seen, 1)
-        envelope = np.maximum.accumulate(precision[:, ::-1], 1)[:, ::-1]
-        if pool.drop_first_segment:
-            is_first = (seen == weight) & (weight > 0)
-            # Of several copies of the first detection only the first is left out, unless copies are one step.
-            gain -= np.where(is_first, np.minimum(gain, 1) if pool.group_start is None else gain, 0)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            ap[rows] = np.where(n_gt[rows] > 0, (gain * envelope).sum(1) / n_gt[rows], np.nan)
-    return ap
+    start = pool.group_start
+    last = np.arange(len(pool.tp)) if start is None else np.append(start[1:], len(pool.tp))[: len(start)] - 1
+    # Of several copies of the first detection only the first is left out, unless copies are one step.
+    drop_first = 0 if not pool.drop_first_segment else 1 if start is None else 2
+    tp, row = np.ascontiguousarray(pool.tp, np.bool_), np.ascontiguousarray(pool.scenario_row, np.int64)
+    n_gt, drawn = np.ascontiguousarray(pool.n_gt, np.int64), np.ascontiguousarray(weights, np.int64)
+    return resample_ap(tp, row, last, n_gt, drawn, drop_first)
 
 
 def weighted_recall(pool: PooledMatches, weights: np.ndarray) -> np.ndarray:
