@@ -151,7 +151,7 @@ def test_points_of_equal_bytes_stand_side_by_side_and_the_axis_states_it() -> No
     )
 
 
-def test_lines_of_equal_values_are_told_apart_by_their_dashes() -> None:
+def test_lines_of_equal_values_differ_in_their_dashes() -> None:
     rows = [{"group": f"{n} observations", "method": m, "mean_ap": interval(0.4)} for n in (20, 60) for m in ("a", "b")]
     text = draw_figure("map-observations", [stored({"summaries": rows})], LIGHT)
     assert [bool(re.search(f"stroke-dasharray[^>]*stroke: {LIGHT.series_colour(place)}", text)) for place in (0, 1)] == [
