@@ -44,4 +44,4 @@ if __name__ == "__main__":
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(tempfile.mkdtemp()) / "drive"
     if not folder.exists():
         simulate("smoke-opv2v", folder)
-    print(benchmark(open_recording(folder, "test"), ClusterDetector(), methods=["none", "late", "early"]))
+    print(benchmark(open_recording(folder, "test"), ClusterDetector(), methods=["no-fusion", "late", "early"]))

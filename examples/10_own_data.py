@@ -80,4 +80,4 @@ if __name__ == "__main__":
     write_clouds(open_recording(drive, "test"), clouds, num_frames=12)
     recording = open_recording(clouds)
     print(type(recording).__name__, *recording.scenarios)
-    print(benchmark(recording, methods=["none", "late", "early"]))
+    print(benchmark(recording, methods=["no-fusion", "late", "early"]))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import ast
 import re
 import tomllib
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -46,7 +47,23 @@ def test_classifiers_readme_and_constraints_name_the_same_versions() -> None:
 def test_citation_and_changelog_name_the_version() -> None:
     citation, changelog = ((REPOSITORY / name).read_text() for name in ("CITATION.cff", "CHANGELOG.md"))
     assert re.findall(r"^version: (\S+)$", citation, re.MULTILINE) == [__version__]
-    assert re.findall(r"^## \[([\d.]+)\]", changelog, re.MULTILINE)[0] == __version__
+    first, *others = re.findall(r"^## (.+)$", changelog, re.MULTILINE)
+    is_unreleased = first == "[Unreleased]"
+    dated = others if is_unreleased else [first, *others]
+    found = [re.fullmatch(r"\[(\d+)\.(\d+)\.(\d+)\] - \d{4}-\d\d-\d\d", heading) for heading in dated]
+    assert found and None not in found, f"a released section is '## [VERSION] - YEAR-MONTH-DAY'; got {dated}"
+    released = [tuple(map(int, match.groups())) for match in found if match]
+    assert released == sorted(set(released), reverse=True)
+    current = tuple(int(part) for part in __version__.split("."))
+    if is_unreleased:
+        assert f"\n## [Unreleased]\n\nWhat becomes version {__version__}.\n" in changelog and current > released[0]
+    else:
+        assert current == released[0]
+
+
+def test_every_group_of_changes_stands_apart() -> None:
+    lines = (REPOSITORY / "CHANGELOG.md").read_text().splitlines()
+    assert [line for before, line in pairwise(lines) if line.startswith("#") and before.strip()] == []
 
 
 def test_every_dependency_is_pinned_to_a_version_that_its_bound_admits() -> None:

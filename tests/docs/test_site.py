@@ -8,6 +8,7 @@ import json
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -15,6 +16,7 @@ from typing import Any
 
 import pytest
 import yaml
+from tests.viz.chromium import Browser, find_program
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -31,6 +33,10 @@ QUESTIONS = {
     "fine-tune": "guides/fine-tune.html",
 }
 """What a reader types into the search, and the page that answers."""
+SHOWN_PAGES = (
+    "index.html", "quickstart.html", "guides/own-detector.html", "benchmarks/detection.html", "papers/costr.html",
+)  # fmt: skip
+FOUND_LINKS = "[...document.querySelectorAll('.md-search-result__link')].map(link => link.href)"
 RUN_PAGES = (
     "quickstart", "guides/byte-budget", "guides/score-threshold", "guides/sensor-frame", "guides/correct-poses",
     "guides/architecture-of-a-model", "guides/map-cluster",
@@ -186,3 +192,53 @@ def test_the_site_builds_and_asks_no_other_machine(site: Path) -> None:
 def test_the_search_finds_the_page_that_answers(site: Path, query: str, page: str) -> None:
     sections = json.loads((site / "search" / "search_index.json").read_text())["docs"]
     assert page in rank_pages(sections, query)[:3]
+
+
+@pytest.fixture(scope="module")
+def browser(site: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """A browser that shows the folder of the site without a server, with its search ready."""
+    program = find_program()
+    if program is None:
+        pytest.skip("no Chromium is installed: the site was checked by its files only")
+    browser = Browser(program, str(tmp_path_factory.mktemp("profile")))
+    browser.open(f"{(site / 'index.html').as_uri()}?q=manyeyes", ready=f"{FOUND_LINKS}.length > 0")
+    yield browser
+    browser.close()
+
+
+def wait_for(browser: Browser, expression: str) -> None:
+    """Wait until an expression is true, at most a minute."""
+    end = time.monotonic() + 60
+    while browser.value(expression) is not True:
+        assert time.monotonic() < end, expression
+        time.sleep(0.2)
+
+
+@pytest.mark.slow
+def test_the_search_of_the_site_lists_the_pages_that_answer(site: Path, browser: Browser) -> None:
+    """Typed one after the other into the search of one page."""
+    field = "document.querySelector('[data-md-component=search-query]')"
+    for query, page in QUESTIONS.items():
+        for text, expected in (("", f"{FOUND_LINKS}.length == 0"), (query, f"{FOUND_LINKS}.length > 0")):
+            browser.value(f"{field}.value = {text!r}; {field}.dispatchEvent(new Event('keyup'))")
+            wait_for(browser, expected)
+        found = [re.split(r"[?#]", link)[0] for link in browser.value(FOUND_LINKS)]
+        assert (site / page).as_uri() in list(dict.fromkeys(found))[:3], query
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", SHOWN_PAGES)
+def test_a_page_is_as_wide_as_the_window_and_has_its_pictures(site: Path, browser: Browser, page: str) -> None:
+    browser.ask("Page.navigate", url=(site / page).as_uri())
+    wait_for(browser, f"location.href.endsWith({page!r}) && document.readyState == 'complete'")
+    pictures = "[...document.images].filter(picture => picture.offsetParent)"
+    cut = (
+        "[...document.querySelectorAll('article *')].filter(part => part.getBoundingClientRect().right > innerWidth + 1"
+        " && !part.closest('.md-typeset__scrollwrap, pre, .highlight, .plot')).map(part => part.outerHTML.slice(0, 80))"
+    )
+    for width in (1280, 390):
+        browser.resize(width, 800)
+        wait_for(browser, f"document.documentElement.scrollWidth == {width}")
+        wait_for(browser, f"{pictures}.every(picture => picture.naturalWidth > 0)")
+        assert (browser.value(f"{pictures}.length") > 0) == (page in ("index.html", "benchmarks/detection.html"))
+        assert browser.value(cut) == []

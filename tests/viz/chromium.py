@@ -62,13 +62,13 @@ class Browser:
                 assert "result" in answer, answer
                 return answer["result"]
 
-    def open(self, url: str) -> None:
-        """Open a page in a tab of its own, and wait until its script has set ``data-ready`` of the body."""
+    def open(self, url: str, ready: str = "document.body && document.body.dataset.ready") -> None:
+        """Open a page in a tab of its own, and wait for an expression; by default for ``data-ready`` of the body."""
         self.session = None
         target = self.ask("Target.createTarget", url=url)["targetId"]
         self.session = self.ask("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         end = time.monotonic() + 60
-        while self.value("document.body && document.body.dataset.ready") is None:
+        while self.value(ready) in (None, False):
             assert time.monotonic() < end, "the page was never drawn"
             time.sleep(0.1)
 

@@ -13,11 +13,11 @@ import pytest
 from manyeyes.cli.main import main
 from manyeyes.datatypes import ConfigError
 from manyeyes.viz.documents import END, update_text
-from manyeyes.viz.figure_svg import THEMES
+from manyeyes.viz.figure_svg import THEMES, Panel, draw_svg, spread_points
 from manyeyes.viz.stored_figures import FIGURES, draw_figure
 from manyeyes.viz.stored_tables import StoredResult
 
-pytest.importorskip("matplotlib")
+Figure = pytest.importorskip("matplotlib.figure").Figure
 
 LIGHT, DARK = THEMES
 
@@ -96,6 +96,12 @@ RESULTS: dict[str, dict[str, Any]] = {
             {"case": "16 beams", "weights": "w", "drive": 0, "agents": 4, "present_stages_ms": {"share: a": 1.0}}
         ]
     },
+    "malicious-agents": {
+        "rows": [
+            {"attack": attack, "fraction": 0.2, "offset_m": offset, "found": {"successes": 3, "total": 4, "low": 0.2, "high": 0.99}}
+            for attack in ("independent", "colluding") for offset in (0.5, 2.0)
+        ]
+    },
     "map-cost": {
         "costs": [{"way": "tiles", "cells": n, "seconds": n / 1e4, "peak_mib": 50.0} for n in (1000, 4000)]
     },
@@ -134,6 +140,52 @@ def test_forms_of_a_method_have_labels_of_their_own() -> None:
     rows = [ap_row("late", 0.7, 2048.0), ap_row("late-temporal", 0.8, 2048.0)]
     text = draw_figure("ap-bytes", [stored({"rows": rows})], LIGHT)
     assert "late + memory" in text and ">late<" in text
+
+
+def test_points_of_equal_bytes_stand_side_by_side_and_the_axis_states_it() -> None:
+    assert spread_points([11.2, 16.0, 11.2, 11.8], 0.16) == pytest.approx([11.12, 16.0, 11.28, 11.8])
+    assert spread_points([1.0, 2.0], 0.5) == [1.0, 2.0] and spread_points([], 0.5) == []
+    rows = [ap_row("late", 0.7, 2048.0), ap_row("late-weighted", 0.71, 2048.0)]
+    assert ">log2(bytes per message), equal bytes side by side<" in draw_figure(
+        "ap-bytes", [stored({"rows": rows})], LIGHT
+    )
+
+
+def test_lines_of_equal_values_differ_in_their_dashes() -> None:
+    rows = [{"group": f"{n} observations", "method": m, "mean_ap": interval(0.4)} for n in (20, 60) for m in ("a", "b")]
+    text = draw_figure("map-observations", [stored({"summaries": rows})], LIGHT)
+    assert [bool(re.search(f"stroke-dasharray[^>]*stroke: {LIGHT.series_colour(place)}", text)) for place in (0, 1)] == [
+        False, True,
+    ]  # fmt: skip
+
+
+def test_short_stages_of_a_step_are_one_bar() -> None:
+    stages = {f"share: {name}": float(time) for name, time in zip("abcdef", (6, 5, 4, 3, 2, 1), strict=True)}
+    row = {"case": "c", "weights": "w", "drive": 0, "agents": 4, "present_stages_ms": {**stages, "share: other": 9.0}}
+    figure = FIGURES["latency-stack"].make([stored({"rows": [row]})])[0]
+    axes = Figure().add_subplot()
+    figure.draw(axes, LIGHT)
+    widths = {bars.get_label(): bars[0].get_width() for bars in axes.containers}
+    assert widths == {"share: a": 6.0, "share: b": 5.0, "share: c": 4.0, "share: d": 3.0, "share: other": 12.0}
+    assert sum(widths.values()) == sum(row["present_stages_ms"].values())
+
+
+def test_the_oracle_is_a_level_since_attacks_do_not_change_it() -> None:
+    oracle = {"attack": "none", "method": "late", "defence": "oracle", "num_malicious": 1, "ap": [interval(0.4)]}
+    text = draw_figure("attacks", [stored({"rows": [*RESULTS["attacks"]["rows"], oracle]})], LIGHT)
+    assert ">oracle: malicious agent left out<" in text and "defence: oracle" not in text and ">no attack<" in text
+
+
+def test_a_legend_has_lines_of_equal_length() -> None:
+    def draw(axes: Any, theme: Any) -> None:
+        for name in ("no-fusion-temporal", "late-temporal", "intermediate-temporal", "early-temporal"):
+            axes.plot([0.0], [0.0], label=name)
+
+    text = draw_svg([Panel("", "", "", draw)], LIGHT)
+    heights = [
+        re.search(rf'y="([\d.]+)"[^>]*>{name}<', text) for name in ("no-fusion-temporal", "intermediate-temporal")
+    ]
+    assert heights[0] is not None and heights[1] is not None and heights[0][1] == heights[1][1]
 
 
 def test_combined_disturbances_are_not_on_the_axis_of_one() -> None:

@@ -5,6 +5,7 @@ import math
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,16 @@ from manyeyes.datatypes import AgentFrame, BevGrid, Boxes, ConfigError, GroundTr
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.viz import birds_eye
 from manyeyes.viz.animation import save_animation, stack_images
-from manyeyes.viz.birds_eye import AGENT_COLOURS, FOUND, TRUE, draw_scene, make_scene, make_viewport, save_png
+from manyeyes.viz.birds_eye import (
+    AGENT_COLOURS,
+    FOUND,
+    TRUE,
+    draw_scene,
+    make_scene,
+    make_viewport,
+    place_legend,
+    save_png,
+)
 from manyeyes.viz.canvas import Viewport, draw_points
 from manyeyes.viz.report import HtmlReport, ReportImage, render, save_report
 from manyeyes.viz.table import HEADINGS, MethodRow, format_cells, format_markdown, make_terminal_table
@@ -68,6 +78,26 @@ def test_a_true_box_is_drawn_at_its_position_and_not_mirrored() -> None:
         assert near(image, x, y, TRUE)
     for x, y in ((12 + 2.3, -6), (-12 - 2.3, 6), (6, 12), (12, 6)):
         assert not near(image, x, y, TRUE)
+
+
+def test_the_legend_begins_a_new_line_where_the_picture_ends() -> None:
+    assert place_legend([100.0, 50.0, 80.0], 240.0) == [(0, 0.0), (0, 119.0), (1, 0.0)]
+    assert place_legend([100.0, 50.0], 170.0) == [(0, 0.0), (0, 119.0)] and place_legend([500.0], 100.0) == [(0, 0.0)]
+
+
+@pytest.mark.parametrize("width", [560, 640, 1280])
+def test_neither_legend_nor_names_of_agents_are_cut_off(width: int) -> None:
+    one = snapshot().frames[0]
+    low = one.world_from_agent @ Transform.from_xyz_yaw(5.0, GRID.y_min - 3.5, 0.0, 0.0)
+    frames = (one, *(replace(one, agent_id=700 + i, world_from_agent=low) for i in range(5)))
+    image = np.asarray(draw_scene(make_scene(Snapshot("made", 0, frames), box(5, 5)), GRID, width=width)).astype(int)
+    footer = image[-birds_eye.FOOTER_HEIGHT :]
+    assert (footer[:, -8:] == 255).all() and (footer[:3] == 255).all() and (footer[-3:] == 255).all()
+    for colour in AGENT_COLOURS:
+        assert (np.abs(footer - colour).sum(-1) < 60).any(), "an agent is missing in the legend"
+    column, row = make_viewport(GRID, width).to_pixels(np.array([5.0, GRID.y_min - 3.5]))
+    above = image[int(row) - 27 : int(row) - 12, int(column) - 30 : int(column) + 30]
+    assert (np.abs(above - AGENT_COLOURS[5]).sum(-1) < 60).any(), "the name of an agent at the bottom is not above it"
 
 
 def test_left_of_the_ego_is_up_and_ahead_is_right() -> None:

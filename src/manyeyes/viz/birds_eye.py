@@ -8,7 +8,7 @@ true pose, so a pose error shows as it is.
 from __future__ import annotations
 
 import io
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,6 +41,9 @@ AGENT_COLOURS: tuple[Colour, ...] = (
 MAX_GROUND_HEIGHT_M = 0.3
 GROUND_INK, POINT_INK, MISSING_INK_FACTOR = 0.12, 0.9, 0.2
 HEADER_HEIGHT, FOOTER_HEIGHT = 58, 44
+MARGIN, LEGEND_GAP, LEGEND_LINE_HEIGHT = 16.0, 19.0, 18.0
+LEGEND_SIZES = (12, 10, 8)
+"""Sizes of the legend's letters, pixels: the first with which it takes at most two lines, else the last."""
 
 
 @dataclass(frozen=True)
@@ -181,7 +184,15 @@ def _draw_agent(pen: Pen, viewport: Viewport, agent: SceneAgent, colour: Colour)
     turn = yaw + np.pi * np.asarray(angles)
     shape = centre + np.stack((np.cos(turn), -np.sin(turn)), -1) * reach[:, None]
     pen.polygon(shape, colour, BACKGROUND, 1.5)
-    pen.text((float(centre[0]), float(centre[1]) + 13), agent.name, colour, 12, "ma", True)
+    is_at_bottom = centre[1] + 27 > viewport.size[1] - viewport.bottom_margin
+    pen.text(
+        (float(centre[0]), float(centre[1]) + (-13 if is_at_bottom else 13)),
+        agent.name,
+        colour,
+        12,
+        "md" if is_at_bottom else "ma",
+        True,
+    )
 
 
 def _draw_frame(pen: Pen, viewport: Viewport, scene: BirdsEyeScene, title: str, caption: str) -> None:
@@ -189,25 +200,52 @@ def _draw_frame(pen: Pen, viewport: Viewport, scene: BirdsEyeScene, title: str, 
     width, height = viewport.size
     for top, bottom in ((0, HEADER_HEIGHT), (height - FOOTER_HEIGHT, height)):
         pen.polygon(np.array([[0, top], [width, top], [width, bottom], [0, bottom]]), BACKGROUND)
-    pen.text((16, 10), title, INK, 18)
-    pen.text((16, 35), caption, (84, 110, 122), 13)
-    y = height - FOOTER_HEIGHT / 2
-    x = 16.0
+    pen.text((MARGIN, 10), title, INK, 18)
+    pen.text((MARGIN, 35), caption, (84, 110, 122), 13)
+    _draw_legend(pen, viewport, scene)
+    metres = 10 if viewport.x_max - viewport.x_min < 120 else 20
+    end = width - MARGIN
+    start, y = end - metres * viewport.scale, 22.0
+    pen.line(np.array([[start, y - 4], [start, y + 4], [start, y], [end, y], [end, y - 4], [end, y + 4]]), INK, 1.5)
+    pen.text((start - 8, y), f"{metres} m", INK, 12, "rm")
+
+
+def _draw_legend(pen: Pen, viewport: Viewport, scene: BirdsEyeScene) -> None:
+    """Kinds of boxes, then agents, in the footer; entries that do not fit into a line begin the next one."""
+    width, height = viewport.size
     kinds = (
         (TRUE, "true, seen", bool(scene.seen.any())),
         (UNSEEN, "true, met by no agent", not bool(scene.seen.all())),
         (FOUND, "detection, score in %", len(scene.detections) > 0),
     )
-    for colour, text in ((colour, text) for colour, text, present in kinds if present):
-        pen.polygon(np.array([[x, y - 5], [x + 18, y - 5], [x + 18, y + 5], [x, y + 5]]), None, colour, 1.8)
-        pen.text((x + 25, y), text, INK, 12, "lm")
-        x += 25 + pen.width(text, 12) + 20
-    for index, agent in enumerate(scene.agents):
-        pen.disc(np.array([x + 5, y]), 5, _agent_colour(index), BACKGROUND, 1)
-        pen.text((x + 15, y), agent.name, INK, 12, "lm")
-        x += 15 + pen.width(agent.name, 12) + 18
-    metres = 10 if viewport.x_max - viewport.x_min < 120 else 20
-    end = width - 16.0
-    start, y = end - metres * viewport.scale, 22.0
-    pen.line(np.array([[start, y - 4], [start, y + 4], [start, y], [end, y], [end, y - 4], [end, y + 4]]), INK, 1.5)
-    pen.text((start - 8, y), f"{metres} m", INK, 12, "rm")
+    entries = [(text, colour, True) for colour, text, present in kinds if present]
+    entries += [(agent.name, _agent_colour(index), False) for index, agent in enumerate(scene.agents)]
+    layouts = [
+        (
+            size,
+            place_legend(
+                [(25 if is_box else 15) + pen.width(text, size) for text, _, is_box in entries], width - 2 * MARGIN
+            ),
+        )
+        for size in LEGEND_SIZES
+    ]
+    size, places = next((layout for layout in layouts if max(layout[1])[0] <= 1), layouts[-1])
+    num_lines = 1 + max(places)[0]
+    for (text, colour, is_box), (line, left) in zip(entries, places):
+        x, y = MARGIN + left, height - FOOTER_HEIGHT / 2 + LEGEND_LINE_HEIGHT * (line - (num_lines - 1) / 2)
+        if is_box:
+            pen.polygon(np.array([[x, y - 5], [x + 18, y - 5], [x + 18, y + 5], [x, y + 5]]), None, colour, 1.8)
+        else:
+            pen.disc(np.array([x + 5, y]), 5, colour, BACKGROUND, 1)
+        pen.text((x + (25 if is_box else 15), y), text, INK, size, "lm")
+
+
+def place_legend(lengths: Sequence[float], width: float) -> list[tuple[int, float]]:
+    """Place entries of the given lengths in lines of a width: the line and the left end of each, pixels."""
+    places, line, left = list[tuple[int, float]](), 0, 0.0
+    for length in lengths:
+        if left and left + length > width:
+            line, left = line + 1, 0.0
+        places.append((line, left))
+        left += length + LEGEND_GAP
+    return places

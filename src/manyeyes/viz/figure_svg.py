@@ -19,6 +19,7 @@ _PANEL_WIDTH_IN, _SINGLE_PANEL_WIDTH_IN, _LEGEND_LINE_IN = 4.1, 7.4, 0.22
 _LEGEND_LETTER_IN, _LEGEND_MARK_IN = 0.08, 0.55
 """Width of a letter of a legend, and of a mark with its margins, inches."""
 _FORM_SUFFIX = "-temporal"
+_LINE_STYLES = ("-", "--", "-.", ":")
 
 
 @dataclass(frozen=True)
@@ -92,9 +93,12 @@ def draw_svg(panels: Sequence[Panel], theme: Theme, height_in: float = 3.1) -> s
         handles = {str(h.get_label()): h for a in figure.axes for h in a.get_legend_handles_labels()[0]}
         if handles:
             widest = max(map(len, handles)) * _LEGEND_LETTER_IN + _LEGEND_MARK_IN
-            columns = min(len(handles), max(1, int(width / widest)))
-            figure.set_size_inches(width, height_in + _LEGEND_LINE_IN * math.ceil(len(handles) / columns))
-            figure.legend([*handles.values()], [*handles], frameon=False, loc="outside lower center", ncols=columns)
+            lines = math.ceil(len(handles) / min(len(handles), max(1, int(width / widest))))
+            figure.set_size_inches(width, height_in + _LEGEND_LINE_IN * lines)
+            figure.legend(
+                [*handles.values()], [*handles], frameon=False, loc="outside lower center",
+                ncols=math.ceil(len(handles) / lines),
+            )  # fmt: skip
         text = io.StringIO()
         figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
     return "\n".join(line.rstrip() for line in text.getvalue().splitlines()) + "\n"
@@ -112,11 +116,26 @@ def draw_point(
     )  # fmt: skip
 
 
-def draw_line(axes: Axes, x: Sequence[float], intervals: Sequence[dict[str, float]], colour: str, label: str) -> None:
-    """Add a line through values with a band of their intervals, in the order of x."""
+def draw_line(
+    axes: Axes, x: Sequence[float], intervals: Sequence[dict[str, float]], theme: Theme, place: int, label: str
+) -> None:
+    """Add a line through values with a band of their intervals, in the order of x.
+
+    place: of the series; lines of neighbouring places differ in colour and in dashes, so that equal values are still two lines.
+    """
     order = sorted(range(len(x)), key=lambda i: x[i])
     ordered = [intervals[i] for i in order]
-    axes.plot([x[i] for i in order], [i["value"] for i in ordered], color=colour, marker="o", ms=4, lw=1.6, label=label)
+    colour, style = theme.series_colour(place), _LINE_STYLES[place % len(_LINE_STYLES)]
+    axes.plot(
+        [x[i] for i in order],
+        [i["value"] for i in ordered],
+        color=colour,
+        ls=style,
+        marker="o",
+        ms=4,
+        lw=1.6,
+        label=label,
+    )
     axes.fill_between(
         [x[i] for i in order], [i["low"] for i in ordered], [i["high"] for i in ordered], color=colour, alpha=0.15, lw=0
     )
@@ -131,3 +150,19 @@ def draw_level(axes: Axes, interval: dict[str, float], colour: str, label: str) 
 def split_form(method: str) -> tuple[str, bool]:
     """Return the name of a method without its form, and whether it has memory."""
     return method.removesuffix(_FORM_SUFFIX), method.endswith(_FORM_SUFFIX)
+
+
+def spread_points(x: Sequence[float], distance: float) -> list[float]:
+    """Move points that are closer than a distance apart, each group about its mean, in the order of the points."""
+    moved = [float(value) for value in x]
+    groups: list[list[int]] = []
+    for i in sorted(range(len(x)), key=lambda i: x[i]):
+        if groups and x[i] - x[groups[-1][-1]] < distance:
+            groups[-1].append(i)
+        else:
+            groups.append([i])
+    for group in (g for g in groups if len(g) > 1):
+        mean = sum(x[i] for i in group) / len(group)
+        for rank, i in enumerate(sorted(group)):
+            moved[i] = mean + distance * (rank - (len(group) - 1) / 2)
+    return moved

@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from manyeyes.datatypes import ConfigError
-from manyeyes.viz.figure_svg import Panel, Theme, draw_level, draw_line, draw_point, draw_svg, split_form
+from manyeyes.viz.figure_svg import Panel, Theme, draw_level, draw_line, draw_point, draw_svg, split_form, spread_points
 from manyeyes.viz.stored_tables import StoredResult
 
-_STACK_ALPHAS = (1.0, 0.75, 0.55, 0.4, 0.28, 0.2, 0.14)
-"""Opacity of the stages of a stack, one after the other."""
+_STACK_ALPHAS = (1.0, 0.74, 0.54, 0.38, 0.25)
+"""Opacity of the stages of a stack, one after the other; the last is that of all shorter stages together."""
+_POINT_DISTANCE_LOG2 = 0.16
+"""Between the centres of points of equal bytes, which stand side by side."""
 _IOUS = ("AP@0.5", "AP@0.7")
 
 
@@ -53,19 +55,23 @@ def _make_ap_bytes(results: Sequence[StoredResult]) -> list[Panel]:
         name, has_memory = split_form(method)
         return f"{name} + memory" if has_two_forms and has_memory else name
 
+    sent = [row for row in rows if row["bytes_per_message"]]
+    exact = [math.log2(row["bytes_per_message"]) for row in sent]
+    drawn = spread_points(exact, _POINT_DISTANCE_LOG2)
+    xlabel = "log2(bytes per message)" + (", equal bytes side by side" if drawn != exact else "")
+
     def make_panel(field: str, title: str) -> Panel:
         def draw(axes: Any, theme: Theme) -> None:
-            for row in rows:
+            for row in (row for row in rows if not row["bytes_per_message"]):
                 name, has_memory = split_form(row["method"])
-                colour = theme.series_colour(names.index(name))
-                if row["bytes_per_message"]:
-                    x = math.log2(row["bytes_per_message"])
-                    hollow = has_two_forms and not has_memory
-                    draw_point(axes, x, row[field], colour, label_of(row["method"]), hollow=hollow)
-                elif has_memory or not has_level_with_memory:
-                    draw_level(axes, row[field], colour, label_of(row["method"]))
+                if has_memory or not has_level_with_memory:
+                    draw_level(axes, row[field], theme.series_colour(names.index(name)), label_of(row["method"]))
+            for row, x in zip(sent, drawn):
+                name, has_memory = split_form(row["method"])
+                colour, hollow = theme.series_colour(names.index(name)), has_two_forms and not has_memory
+                draw_point(axes, x, row[field], colour, label_of(row["method"]), hollow=hollow)
 
-        return Panel(title, "log2(bytes per message)", title, draw)
+        return Panel(title, xlabel, title, draw)
 
     return [make_panel("ap50", _IOUS[0]), make_panel("ap70", _IOUS[1])]
 
@@ -117,7 +123,7 @@ def _make_robustness(results: Sequence[StoredResult]) -> list[Panel]:
                     draw_level(axes, mine[0]["ap"][1], theme.series_colour(place), method)
                 elif mine:
                     x = [row["perturbation"][field] for row in mine]
-                    draw_line(axes, x, [row["ap"][1] for row in mine], theme.series_colour(place), method)
+                    draw_line(axes, x, [row["ap"][1] for row in mine], theme, place, method)
 
         return Panel("", label, _IOUS[1], draw)
 
@@ -143,7 +149,7 @@ def _make_num_agents(results: Sequence[StoredResult]) -> list[Panel]:
             for place, method in enumerate(methods):
                 mine = [(row["num_agents"], get(row)) for row in rows if row["method"] == method]
                 found = [(float(n), interval) for n, interval in mine if interval is not None]
-                draw_line(axes, [n for n, _ in found], [i for _, i in found], theme.series_colour(place), method)
+                draw_line(axes, [n for n, _ in found], [i for _, i in found], theme, place, method)
             axes.set_xticks(sorted({row["num_agents"] for row in rows}))
 
         return Panel(title, "agents", ylabel, draw)
@@ -229,7 +235,7 @@ def _make_reliability(results: Sequence[StoredResult]) -> list[Panel]:
         axes.plot([0.0, 1.0], [0.0, 1.0], color=theme.text, lw=1.0, ls="--", label="calibrated")
         for place, row in enumerate(rows):
             x = [part["mean_score"] for part in row["bins"]]
-            draw_line(axes, x, [part["correct"] for part in row["bins"]], theme.series_colour(place), row["method"])
+            draw_line(axes, x, [part["correct"] for part in row["bins"]], theme, place, row["method"])
 
     return [Panel("", "score", "fraction of correct boxes, IoU 0.5", draw)]
 
@@ -242,7 +248,7 @@ def _make_map_observations(results: Sequence[StoredResult]) -> list[Panel]:
         for place, method in enumerate(methods):
             mine = [row for row in rows if row["method"] == method]
             x = [float(row["group"].split()[0]) for row in mine]
-            draw_line(axes, x, [row["mean_ap"] for row in mine], theme.series_colour(place), method)
+            draw_line(axes, x, [row["mean_ap"] for row in mine], theme, place, method)
         ticks = sorted({float(row["group"].split()[0]) for row in rows})
         axes.set_xscale("log")
         axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
@@ -253,29 +259,32 @@ def _make_map_observations(results: Sequence[StoredResult]) -> list[Panel]:
 
 def _make_latency_stack(results: Sequence[StoredResult]) -> list[Panel]:
     rows = [row for stored in results for row in stored.result["rows"] if row["drive"] is not None][::-1]
-    stages = list(dict.fromkeys(stage for row in rows[::-1] for stage in row["present_stages_ms"]))
+    times = [row["present_stages_ms"] for row in rows]
 
     def draw(axes: Any, theme: Theme) -> None:
         left = [0.0] * len(rows)
         for place, part in enumerate(("share", "perceive")):
-            mine = [stage for stage in stages if stage.startswith(part)]
-            for number, stage in enumerate(mine):
-                widths = [row["present_stages_ms"].get(stage, 0.0) for row in rows]
-                alpha = _STACK_ALPHAS[min(number, len(_STACK_ALPHAS) - 1)]
+            for alpha, (label, stages) in zip(_STACK_ALPHAS, _group_stages(times, part), strict=False):
+                widths = [sum(of_row.get(stage, 0.0) for stage in stages) for of_row in times]
                 axes.barh(
-                    range(len(rows)),
-                    widths,
-                    0.62,
-                    left=left,
-                    color=theme.series_colour(place),
-                    alpha=alpha,
-                    label=stage,
-                )
+                    range(len(rows)), widths, 0.62, left=left, color=theme.series_colour(place), alpha=alpha, label=label
+                )  # fmt: skip
                 left = [a + b for a, b in zip(left, widths)]
         names = [f"{row['case']},\n{row['weights']}, {row['agents']:g} agents" for row in rows]
         axes.set_yticks(range(len(rows)), names)
 
     return [Panel("One step of an agent, by stage", "CPU time on one core [ms]", "", draw)]
+
+
+def _group_stages(times: Sequence[dict[str, float]], part: str) -> list[tuple[str, list[str]]]:
+    """Return labels and stages of one part of a step, the longest first; what has no opacity of its own is the last label."""
+    longest = {stage: max(t.get(stage, 0.0) for t in times) for of_row in times for stage in of_row}
+    stages = sorted((stage for stage in longest if stage.startswith(f"{part}:")), key=lambda s: (-longest[s], s))
+    if len(stages) <= len(_STACK_ALPHAS):
+        return [(stage, [stage]) for stage in stages]
+    rest = f"{part}: other"
+    named = [stage for stage in stages if stage != rest][: len(_STACK_ALPHAS) - 1]
+    return [*((stage, [stage]) for stage in named), (rest, [stage for stage in stages if stage not in named])]
 
 
 def _make_map_cost(results: Sequence[StoredResult]) -> list[Panel]:
@@ -302,7 +311,9 @@ def _make_attacks(results: Sequence[StoredResult]) -> list[Panel]:
     alone = [row for row in rows if row["method"] == "no-fusion" and row["attack"] == "none"]
     played = [row for row in rows if row["method"] != "no-fusion"]
     attacks = list(dict.fromkeys(row["attack"] for row in played))[::-1]
-    defences = list(dict.fromkeys(row["defence"] for row in played))
+    # The oracle leaves malicious agents out, whatever they send: without attack, its result is that under every attack.
+    oracle = [row for row in played if row["defence"] == "oracle" and row["attack"] == "none"]
+    defences = list(dict.fromkeys(row["defence"] for row in played if row["defence"] != "oracle"))
 
     def draw(axes: Any, theme: Theme) -> None:
         for place, defence in enumerate(defences):
@@ -317,11 +328,34 @@ def _make_attacks(results: Sequence[StoredResult]) -> list[Panel]:
                 values, y, xerr=errors, color=theme.series_colour(place), marker="o", ms=4, capsize=2, ls="none",
                 label=f"defence: {defence}",
             )  # fmt: skip
-        if alone:
-            axes.axvline(alone[0]["ap"][0]["value"], color=theme.text, lw=1.0, ls="--", label="ego alone")
-        axes.set_yticks(range(len(attacks)), attacks)
+        levels = (("ego alone", alone, "--"), ("oracle: malicious agent left out", oracle, ":"))
+        for label, level, style in ((label, level, style) for label, level, style in levels if level):
+            axes.axvline(level[0]["ap"][0]["value"], color=theme.text, lw=1.2, ls=style, label=label)
+        axes.set_yticks(range(len(attacks)), ["no attack" if attack == "none" else attack for attack in attacks])
 
     return [Panel("", f"{_IOUS[0]}, 95 % interval over scenarios", "", draw)]
+
+
+def _make_malicious_agents(results: Sequence[StoredResult]) -> list[Panel]:
+    rows = [row for stored in results for row in stored.result["rows"]]
+    fractions = sorted({row["fraction"] for row in rows})
+    offsets = sorted({row["offset_m"] for row in rows})
+
+    def make_panel(attack: str) -> Panel:
+        def draw(axes: Any, theme: Theme) -> None:
+            for place, fraction in enumerate(fractions):
+                mine = [row for row in rows if row["attack"] == attack and row["fraction"] == fraction]
+                found = [{**row["found"], "value": row["found"]["successes"] / row["found"]["total"]} for row in mine]
+                label = f"{fraction:.0%} of agents malicious"
+                draw_line(axes, [row["offset_m"] for row in mine], found, theme, place, label)
+            axes.set_xscale("log")
+            axes.set_xticks(offsets, [f"{offset:g}" for offset in offsets])
+            axes.set_xticks([], minor=True)
+            axes.set_ylim(0.0, 1.02)
+
+        return Panel(attack, "offset [m]", "malicious agents found at 5 % false", draw)
+
+    return [make_panel(attack) for attack in dict.fromkeys(row["attack"] for row in rows)]
 
 
 _EVALUATE = "manyeyes evaluate --data data/carla-towns-small --split test"
@@ -366,6 +400,11 @@ FIGURES = {
     ),
     "map-observations": StoredFigure(
         "mAP of fused maps against the number of observations", "manyeyes study fusion", _make_map_observations
+    ),
+    "malicious-agents": StoredFigure(
+        "Malicious mapping agents found at 5 % false positives against the offset of what they observe",
+        "manyeyes study malicious-agents",
+        _make_malicious_agents,
     ),
     "latency-stack": StoredFigure("CPU time of a step by stage", "python benchmarks/step.py", _make_latency_stack),
     "map-cost": StoredFigure(
