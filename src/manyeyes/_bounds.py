@@ -32,10 +32,12 @@ class Bounds:
 class PathRole:
     """How a command uses a path, as metadata of ``typing.Annotated``: an existing input, or where it writes."""
 
-    kind: Literal["input", "output folder", "output file"]
+    kind: Literal["input", "input map", "output folder", "output file"]
 
 
 InputPath = Annotated[Path, PathRole("input")]
+InputMap = Annotated[str, PathRole("input map")]
+"""A map (``manyeyes.maps.store.map_place``): the folder of 'map fuse', or a store in a folder or at a URL; @N: its release."""
 OutputFolder = Annotated[Path, PathRole("output folder")]
 OutputFile = Annotated[Path, PathRole("output file")]
 PositiveInt = Annotated[int, Bounds("an integer from 1 to 2**63 - 1", 1, MAX_INT)]

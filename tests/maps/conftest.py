@@ -1,7 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A small map with everything that a map can hold, for the tests of stores and formats."""
+"""A small map with everything that a map can hold, and a local S3 server, for the tests of stores and formats."""
 
 import hashlib
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +17,32 @@ from manyeyes.maps.elements.observation import MapFrame
 from manyeyes.maps.elements.vector_map import PointEvidence, Topology, VectorMap
 
 FRAME = MapFrame(48.137, 11.575)
+
+
+@pytest.fixture(scope="session")
+def s3_options():
+    """A local S3 server, as options of the file system."""
+    pytest.importorskip("s3fs", reason="the cloud extra is not installed")
+    pytest.importorskip("moto.server", reason="moto[server] is not installed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
+    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    address = f"http://127.0.0.1:{port}"
+    try:
+        for _ in range(300):
+            try:
+                urllib.request.urlopen(f"{address}/moto-api/", timeout=1).close()
+                break
+            except OSError:
+                time.sleep(0.2)
+        else:
+            pytest.fail("the local S3 server does not answer")
+        yield (("endpoint_url", address), ("key", "test"), ("secret", "test"))
+    finally:
+        server.terminate()
+        server.wait(10)
 
 
 @pytest.fixture

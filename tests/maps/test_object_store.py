@@ -2,11 +2,7 @@
 """A store at a URL is the store in a folder: whole objects, keys created once, releases that are the old or the new one."""
 
 import json
-import socket
-import subprocess
 import sys
-import time
-import urllib.request
 import uuid
 from dataclasses import dataclass, field
 
@@ -52,32 +48,6 @@ OBSERVATIONS = [observation(k) for k in range(9)]
 def lines(*ys: float, x: float = 0.0) -> VectorMap:
     points = [np.stack((np.arange(x, x + 31), np.full(31, y)), 1) for y in ys]
     return VectorMap.of(MapElements.of(points, DIVIDER), FRAME)
-
-
-@pytest.fixture(scope="session")
-def s3_options():
-    """A local S3 server, as options of the file system."""
-    pytest.importorskip("s3fs", reason="the cloud extra is not installed")
-    pytest.importorskip("moto.server", reason="moto[server] is not installed")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    command = [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(port)]
-    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    address = f"http://127.0.0.1:{port}"
-    try:
-        for _ in range(300):
-            try:
-                urllib.request.urlopen(f"{address}/moto-api/", timeout=1).close()
-                break
-            except OSError:
-                time.sleep(0.2)
-        else:
-            pytest.fail("the local S3 server does not answer")
-        yield (("endpoint_url", address), ("key", "test"), ("secret", "test"))
-    finally:
-        server.terminate()
-        server.wait(10)
 
 
 @pytest.fixture(params=["folder", "memory", "s3"])

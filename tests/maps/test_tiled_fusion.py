@@ -79,7 +79,7 @@ def test_small_tiles_give_the_map_of_one_piece_and_no_line_is_cut_at_a_border(st
 @pytest.mark.slow
 def test_poses_of_domains_that_meet_in_the_crossroads_do_not_depend_on_tiles(store, crowd, tmp_path):
     # The middle of a domain is at the origin, so borders lie at 80 m.
-    solver = PoseSolverConfig(domain_m=160.0, domain_halo_m=60.0)
+    solver = PoseSolverConfig(domain_m=160.0, domain_halo_m=60.0, drive_support_m=60.0)
     prior = np.array([o.pose for o in crowd.observations])
     assert len(list_domains(prior, solver)) > 3
     config = MapFusionConfig(pose_solver=solver)
@@ -88,6 +88,12 @@ def test_poses_of_domains_that_meet_in_the_crossroads_do_not_depend_on_tiles(sto
     moved = solve_poses(crowd.observations, solver).pose - solve_poses(crowd.observations).pose
     # This halo is smaller than two views; it cuts lines that matter, and yet poses are those of one domain to some centimetres.
     assert 0.0 < np.median(np.hypot(*moved[:, :2].T)) < 0.02
+
+
+def test_a_drive_that_is_supported_from_beyond_the_halo_is_refused():
+    with pytest.raises(ConfigError, match=r"drive_support_m \(300 m\).*domain_halo_m \(200 m\).*lower .* or raise"):
+        PoseSolverConfig(domain_halo_m=200.0)
+    assert PoseSolverConfig(domain_halo_m=300.0).drive_support_m == 300.0
 
 
 @pytest.mark.slow

@@ -159,6 +159,14 @@ map fuse {obs} --method nosuch | nosuch
 map fuse {obs} --store {folder}/store --executor thread | inline
 map fuse {obs} --store {folder}/store --method union | --store
 map export {map} x.shp | geojson
+map export {map}@2 x.geojson | only a store has releases
+map export nothing://x x.geojson | nothing://x
+map export memory://x/y x.geojson | memory://x/y
+map diff {map} memory://x/y | memory://x/y
+map view memory://x/y | memory://x/y
+map evaluate memory://x/y --truth {map} | memory://x/y
+map import memory://x/y | memory://x/y
+map retract memory://x/y --ids ab --reason x --executor inline | memory://x/y
 map export {map} x.json | x.json
 map export {map} x.json --format geojsn | geojson
 map import {text} | --poses

@@ -46,6 +46,10 @@ def _describe_problem(requirement: Bounds | PathRole, value: Any) -> str | None:
         return None if requirement.contains(value) else f"{requirement.text}; got {value}"
     if requirement.kind == "input":
         return None if value.exists() else f"an existing file or folder; there is no {value}"
+    if requirement.kind == "input map":
+        from manyeyes.maps.store.map_place import MapPlace
+
+        return None if MapPlace.parse(value).exists() else f"a map's folder, or the URL of a store; there is no {value}"
     return _describe_output_problem(value, requirement.kind == "output folder")
 
 

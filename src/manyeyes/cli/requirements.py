@@ -81,10 +81,14 @@ _SHAPELY = Requirement("map", ("shapely",))
 _GEOPACKAGE = Requirement("map", ("pyogrio", "shapely"))
 _PILLOW = Requirement("view", ("PIL",))
 _MATPLOTLIB = Requirement("view", ("matplotlib",))
-_CLOUD = (
-    Requirement("cloud", ("fsspec",)).when("store", "*://*"),
-    Requirement("cloud", EXTRAS["cloud"]).when("store", "s3://*"),
-)
+
+
+def _require_cloud(*options: str) -> tuple[Requirement, ...]:
+    """Return what options need that may be the URL of a store."""
+    needs = (("*://*", ("fsspec",)), ("s3://*", EXTRAS["cloud"]))
+    return tuple(Requirement("cloud", modules).when(name, url) for name in options for url, modules in needs)
+
+
 _EXECUTORS = (
     Requirement("dask", EXTRAS["dask"]).when("executor", "dask"),
     Requirement("ray", EXTRAS["ray"]).when("executor", "ray"),
@@ -112,6 +116,7 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
         _MCAP.when("mcap", "*"),
         _ARROW.when("map", "*"),
         _SHAPELY.when("map", "*"),
+        *_require_cloud("map"),
     ),
     "pose": (_GICP,),
     "doctor": (),
@@ -123,17 +128,18 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
         _ARROW,
         _SHAPELY.when("sources", "*.osm", "*log_map_archive_*.json"),
         Requirement("map", ("pyogrio", "shapely", "pyproj")).when("sources", "*.gpkg", "*.geojson"),
+        *_require_cloud("sources"),
     ),
     "map fuse": (
         _ARROW,
         _SHAPELY.when("method", "polymerge", "global-map-builder", "heatmap-buffer"),
         _SHAPELY.when("store", "*"),
         *_EXECUTORS,
-        *_CLOUD,
+        *_require_cloud("store"),
     ),
-    "map retract": (_ARROW, _SHAPELY, *_EXECUTORS, *_CLOUD),
-    "map evaluate": (_ARROW, _SHAPELY),
-    "map diff": (_ARROW,),
+    "map retract": (_ARROW, _SHAPELY, *_EXECUTORS, *_require_cloud("store")),
+    "map evaluate": (_ARROW, _SHAPELY, *_require_cloud("folder", "truth")),
+    "map diff": (_ARROW, *_require_cloud("old", "new")),
     "map export": (
         _ARROW,
         _SHAPELY.when("format", "geoparquet"),
@@ -141,8 +147,9 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
         _GEOPACKAGE.when("format", "geopackage", "pmtiles"),
         _GEOPACKAGE.when("file", "*.gpkg", "*.pmtiles"),
         Requirement("map", ("pyproj",)).when("crs", "*:*"),
+        *_require_cloud("folder"),
     ),
-    "map view": (_ARROW, _SHAPELY, _MATPLOTLIB.when("out", "*.png")),
+    "map view": (_ARROW, _SHAPELY, _MATPLOTLIB.when("out", "*.png"), *_require_cloud("folder", "truth")),
     "live run": (
         _ZENOH,
         _CRYPTOGRAPHY.when("security.security", "warn", "require"),

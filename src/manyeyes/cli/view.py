@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from manyeyes._bounds import ExtentM, Fraction, InputPath, NonNegativeInt, OutputFile, PixelCount, PositiveInt
+from manyeyes._bounds import ExtentM, Fraction, InputMap, NonNegativeInt, OutputFile, PixelCount, PositiveInt
 from manyeyes.datatypes import ConfigError
 from manyeyes.studies.replay_options import ReplayOptions, make_excerpt
 
@@ -56,8 +56,9 @@ class Options:
     """Log the drive for the viewer Foxglove, instead of drawing: a file .mcap."""
     cloud_color: Literal["agent", "intensity"] = "agent"
     """With --rerun or --mcap: points in a colour of their agent, darker where the intensity is low, or in colours of intensity."""
-    map: InputPath | None = None
-    """With --rerun or --mcap: the folder of a map of the drive, of 'map build' or 'map fuse', to log its elements by kind."""
+    map: InputMap | None = None
+    """With --rerun or --mcap: a map of the drive, to log its elements by kind: the folder of 'map build' or 'map fuse', or a store
+    in a folder or at a URL."""
     half_extent_m: tuple[ExtentM, ExtentM] = (70.4, 38.4)
     """How far the picture reaches ahead and aside, metres; with --detect the detector's range counts."""
     width: PixelCount = 1280

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from manyeyes.maps.elements.observation_file import LoadedObservations, RejectedRows
     from manyeyes.maps.elements.vector_map import VectorMap
     from manyeyes.maps.fusion.observed_ground import ObservedGround
+    from manyeyes.maps.store.store import MapStore
 
 ROWS_PER_FILE = 5000
 LINES_FILE, CROSSINGS_FILE, GROUND_FILE = "lines.parquet", "crossings.parquet", "ground.npz"
@@ -131,15 +132,42 @@ def write_vector_map(vector_map: VectorMap, folder: Path) -> None:
         remove_unfinished(folder, below=False)
 
 
-def read_vector_map(folder: Path) -> VectorMap:
-    """Return the map of a folder that 'map fuse' wrote: a map's own, or a store, whose last release is meant."""
+def open_store(location: Path | str) -> MapStore:
+    """Open the store of maps in a folder or at a URL.
+
+    Raises:
+        StoreError: there is none, it is damaged, or it cannot be reached.
+    """
+    from manyeyes.maps.store.object_store import StoreError
+    from manyeyes.maps.store.store import MapStore
+
+    if not MapStore.exists(location):
+        remedy = (
+            "memory:// is of one process; take a folder or another store"
+            if str(location).startswith("memory://")
+            else f"check the address, or make one with 'manyeyes map fuse OBSERVATIONS --store {location}'"
+        )
+        raise StoreError(f"{location}: there is no store of maps (no store.json); {remedy}.")
+    return MapStore(location)
+
+
+def read_vector_map(place: Path | str) -> VectorMap:
+    """Return the map at a place (:class:`~manyeyes.maps.store.map_place.MapPlace`): one way for all that read maps.
+
+    It is the folder of a map that 'map fuse' wrote; or a store, in a folder or at a URL, of which the last release is meant, or
+    release N of ``PLACE@N``.
+    """
     from manyeyes.maps.formats.geoparquet import read_map
+    from manyeyes.maps.store.map_place import MapPlace
 
-    if (folder / "store.json").is_file():
-        from manyeyes.maps.store.store import MapStore
-
-        return MapStore(folder).read()
-
+    found = MapPlace.parse(place)
+    folder = found.folder
+    if folder is None or (folder / "store.json").is_file():
+        return open_store(found.location).read(found.release)
+    if found.release is not None:
+        raise ConfigError(
+            f"{found}: only a store has releases, and {found.location} is none; leave out @{found.release}."
+        )
     files = [folder / LINES_FILE, folder / CROSSINGS_FILE]
     missing = [file.name for file in files if not file.is_file()]
     if missing:
@@ -150,17 +178,21 @@ def read_vector_map(folder: Path) -> VectorMap:
     return read_map(*files)
 
 
-def read_ground(folder: Path, vector_map: VectorMap) -> ObservedGround:
+def read_ground(place: Path | str, vector_map: VectorMap) -> ObservedGround:
     """Return what a map's observations saw: stored with it, of a store's log, or of the observations beside the map's folder.
 
     Without any of them, the ground near the map's own elements, ``is_assumed``.
     """
     from manyeyes.maps.fusion.observed_ground import ObservedGround
+    from manyeyes.maps.store.map_place import MapPlace
 
+    found = MapPlace.parse(place)
+    folder = found.folder
+    if folder is None or (folder / "store.json").is_file():
+        store = open_store(found.location)
+        return ObservedGround.of_observations(store.observations_of(found.release), store.frame)
     if (folder / GROUND_FILE).is_file():
         return ObservedGround.read(folder / GROUND_FILE)
-    if (folder / "store.json").is_file():
-        return _read_store_ground(folder)
     beside = folder.resolve().parent / "observations"
     if beside.is_dir() and any(beside.glob("*.parquet")):
         from manyeyes.maps.elements.observation_file import read_observations
@@ -168,17 +200,3 @@ def read_ground(folder: Path, vector_map: VectorMap) -> ObservedGround:
         loaded = read_observations(beside)
         return ObservedGround.of_observations(loaded.observations, loaded.frame)
     return ObservedGround.around(vector_map.elements, vector_map.frame)
-
-
-def _read_store_ground(folder: Path) -> ObservedGround:
-    """Return what the observations of a store that count now saw."""
-    import numpy as np
-
-    from manyeyes.maps.fusion.observed_ground import ObservedGround
-    from manyeyes.maps.store.observation_log import read_active
-    from manyeyes.maps.store.store import MapStore
-
-    store = MapStore(folder)
-    active = store.log.active_observations()
-    observations = read_active(store.log.objects, active, np.arange(len(active.ids)))
-    return ObservedGround.of_observations(observations, store.frame)

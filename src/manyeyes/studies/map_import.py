@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from manyeyes._io import parse_json, read_file
 from manyeyes.datatypes import ConfigError
+from manyeyes.maps.store.map_place import MapPlace
 
 if TYPE_CHECKING:
     from manyeyes.datatypes.map_element import MapElements
@@ -23,36 +24,47 @@ _LAYER_ENDINGS = (".gpkg", ".geojson")
 class SourceMap:
     """elements: metres in the frame. left_out: what the file holds and the map does not, and how often."""
 
-    path: Path
+    place: Path | str
     frame: MapFrame
     elements: MapElements
     left_out: Mapping[str, int] = field(default_factory=dict)
 
 
-def is_map(path: Path) -> bool:
-    """Return whether a path is a map, by ending, folder or content; a result file of a map model is none."""
+def is_map(place: Path | str) -> bool:
+    """Return whether a place is a map, by ending, folder, URL or content; a result file of a map model is none."""
+    if _is_own(place):
+        return True
+    path = Path(place)
     if path.is_dir() or path.suffix.lower() in (".osm", *_LAYER_ENDINGS):
         return True
     return path.suffix.lower() == ".json" and _is_argoverse2(path)
 
 
-def read_source_map(path: Path, frame: MapFrame | None = None, crs: str | None = None) -> SourceMap:
-    """Return the elements of an Argoverse 2 map or log, a Lanelet2 map, a GeoPackage, a GeoJSON file, or a map's own folder.
+def read_source_map(place: Path | str, frame: MapFrame | None = None, crs: str | None = None) -> SourceMap:
+    """Return the elements of an Argoverse 2 map or log, a Lanelet2 map, a GeoPackage, a GeoJSON file, an own map or a store.
 
     Args:
-        path: the file or folder. frame: where the elements are wanted; by default about the middle of the map, or its own.
+        place: the file or folder, or the URL of a store. frame: where the elements are wanted; by default about the middle of the
+            map, or its own.
         crs: of a GeoPackage that states none; "local" coordinates of a file without a place on earth are those of ``frame``.
 
     Raises:
         ConfigError: the file is no map, or states no place on earth and there is no ``frame``.
     """
-    if path.is_dir() and any((path / name).is_file() for name in ("store.json", "lines.parquet")):
-        return _read_own(path, frame)
+    if _is_own(place):
+        return _read_own(place, frame)
+    path = Path(place)
     if path.suffix.lower() in _LAYER_ENDINGS:
         return _read_layers(path, frame, crs)
     if path.suffix.lower() == ".osm":
         return _read_lanelet2(path, frame)
     return _read_argoverse2(path, frame)
+
+
+def _is_own(place: Path | str) -> bool:
+    """Return whether a place is the folder of a map, or a store."""
+    folder = MapPlace.parse(place).folder
+    return folder is None or any((folder / name).is_file() for name in ("store.json", "lines.parquet"))
 
 
 def _is_argoverse2(path: Path) -> bool:
@@ -63,15 +75,15 @@ def _is_argoverse2(path: Path) -> bool:
     return isinstance(root, dict) and "lane_segments" in root
 
 
-def _read_own(path: Path, frame: MapFrame | None) -> SourceMap:
+def _read_own(place: Path | str, frame: MapFrame | None) -> SourceMap:
     from manyeyes.maps.formats.reframe import move_to_frame
     from manyeyes.studies.map_folder import read_vector_map
 
-    own = read_vector_map(path)
+    own = read_vector_map(place)
     published = own.select_published()
     left_out = {"element that is not published": len(own) - len(published)} if len(own) > len(published) else {}
     moved = move_to_frame(published, frame or own.frame)
-    return SourceMap(path, moved.frame, moved.elements, left_out)
+    return SourceMap(place, moved.frame, moved.elements, left_out)
 
 
 def _read_layers(path: Path, frame: MapFrame | None, crs: str | None) -> SourceMap:

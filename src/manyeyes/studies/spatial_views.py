@@ -50,15 +50,15 @@ def log_frames(frames: Iterable[SpatialFrame], logs: Sequence[SpatialLog], advan
     return num
 
 
-def read_map_lines(recording: Recording, scenario: str, folder: Path) -> MapLines:
+def read_map_lines(recording: Recording, scenario: str, place: Path | str) -> MapLines:
     """Return the published elements of a map in the world of a scenario, by kind.
 
     Args:
         recording: what the map was built of, which places it: a map is stated about its town's, or the first agent's, position.
         scenario: which of its scenarios.
-        folder: of the map, as ``manyeyes map fuse`` writes it.
+        place: of the map, see :func:`~manyeyes.studies.map_folder.read_vector_map`.
     """
-    vector_map = read_vector_map(folder)
+    vector_map = read_vector_map(place)
     (town_map,) = group_by_town(recording, (scenario,), scenario)
     return _lines_by_kind([vector_map.select_published().elements.transform(*town_map.origin_xy, 0.0)])
 

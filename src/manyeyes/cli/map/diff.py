@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import tyro
 
@@ -15,10 +14,10 @@ from manyeyes._bounds import OutputFile
 class Options:
     """Two maps, of one frame or of two."""
 
-    old: tyro.conf.Positional[Path]
-    """The earlier map's folder, of 'map fuse'."""
-    new: tyro.conf.Positional[Path]
-    """The later map's folder."""
+    old: tyro.conf.Positional[str]
+    """The earlier map: the folder of 'map fuse', or a store in a folder or at a URL (s3://bucket/city; city@2 is its release 2)."""
+    new: tyro.conf.Positional[str]
+    """The later map, likewise."""
     out: OutputFile | None = None
     """Also write this: .json with all numbers, or .html, a page that shows what is new and what is gone."""
 
@@ -31,6 +30,7 @@ def main(options: Options) -> None:
     from manyeyes.evaluation.maps.change_summary import compare_maps
     from manyeyes.maps.formats.reframe import move_to_frame
     from manyeyes.maps.fusion.observed_ground import ASSUMED_MARGIN_M
+    from manyeyes.maps.store.map_place import MapPlace
     from manyeyes.studies import provenance
     from manyeyes.studies.map_folder import read_ground, read_vector_map
     from manyeyes.viz.map_page import make_change_page, save_map_page
@@ -40,13 +40,13 @@ def main(options: Options) -> None:
         raise ConfigError(f"--out ends in .json or .html; got {options.out.name}.")
     console = Console()
     old, new = read_vector_map(options.old), read_vector_map(options.new)
-    grounds = [read_ground(folder, m) for folder, m in ((options.old, old), (options.new, new))]
+    grounds = [read_ground(place, m) for place, m in ((options.old, old), (options.new, new))]
     change = compare_maps(old, new, *grounds)
     console.print(make_change_table(change.kinds, f"From {options.old} to {options.new}"))
-    for folder, ground in zip((options.old, options.new), grounds):
+    for place, ground in zip((options.old, options.new), grounds):
         if ground.is_assumed:
             console.print(
-                f"{folder} has no observations: it is taken to cover the ground within {ASSUMED_MARGIN_M:g} m of its lines.",
+                f"{place} has no observations: it is taken to cover the ground within {ASSUMED_MARGIN_M:g} m of its lines.",
                 highlight=False,
                 soft_wrap=True,
             )
@@ -56,5 +56,6 @@ def main(options: Options) -> None:
         provenance.write_json(options.out, change, options, None)
     else:
         moved = move_to_frame(old, new.frame)
-        save_map_page(make_change_page(f"{options.old.name} to {options.new.name}", moved, new, change), options.out)
+        title = " to ".join(MapPlace.parse(place).name for place in (options.old, options.new))
+        save_map_page(make_change_page(title, moved, new, change), options.out)
     console.print(f"{options.out} holds it", highlight=False, soft_wrap=True)

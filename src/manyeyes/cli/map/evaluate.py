@@ -4,11 +4,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import tyro
 
-from manyeyes._bounds import InputPath
+from manyeyes._bounds import InputMap
 from manyeyes.datatypes import ConfigError
 
 
@@ -16,10 +15,10 @@ from manyeyes.datatypes import ConfigError
 class Options:
     """The map to evaluate."""
 
-    folder: tyro.conf.Positional[Path]
-    """The map's folder, of 'map fuse'."""
-    truth: InputPath | None = None
-    """A map's folder with the truth; 'truth' beside the map is found by itself."""
+    folder: tyro.conf.Positional[str]
+    """The map: the folder of 'map fuse', or a store in a folder or at a URL (s3://bucket/city; city@2 is its release 2)."""
+    truth: InputMap | None = None
+    """The true map, likewise; 'truth' beside the map's folder is found by itself."""
 
 
 def main(options: Options) -> None:
@@ -28,20 +27,22 @@ def main(options: Options) -> None:
 
     from manyeyes.evaluation.maps.metrics import evaluate_map
     from manyeyes.evaluation.maps.spatial_bootstrap import MetricIntervals, bootstrap_ap_interval, bootstrap_f1_interval
+    from manyeyes.maps.store.map_place import MapPlace
     from manyeyes.studies import provenance
     from manyeyes.studies.map_folder import MapFolder, read_vector_map
     from manyeyes.viz.map_table import PROTOCOLS, make_kinds_table
 
-    console, path = Console(), options.folder
-    vector_map = read_vector_map(path).select_published().elements
-    truth_folder = options.truth or path.parent / "truth"
-    if not truth_folder.is_dir():
-        raise ConfigError(f"{truth_folder}: no truth there; name one with --truth.")
-    truth = read_vector_map(truth_folder).elements
-    cut_policy = MapFolder(truth_folder.parent).read_cut_policy()
+    console, place = Console(), MapPlace.parse(options.folder)
+    vector_map = read_vector_map(options.folder).select_published().elements
+    true_place = options.truth or place.beside("truth")
+    if true_place is None:
+        raise ConfigError(f"{place}: there is no folder 'truth' beside this map; name the true map with --truth.")
+    truth = read_vector_map(true_place).elements
+    true_folder = MapPlace.parse(true_place).folder
+    cut_policy = None if true_folder is None else MapFolder(true_folder.parent).read_cut_policy()
     evaluated = cut_policy(vector_map) if cut_policy else vector_map
     metrics = evaluate_map(evaluated, truth)
-    console.print(make_kinds_table(metrics, f"{path} against {truth_folder}"))
+    console.print(make_kinds_table(metrics, f"{place} against {true_place}"))
     intervals = tuple(
         MetricIntervals(
             row.kind,
@@ -59,6 +60,6 @@ def main(options: Options) -> None:
             highlight=False,
             soft_wrap=True,
         )
-    out, mean_ap = path / "quality.json", {protocol: metrics.mean_ap(protocol) for protocol in PROTOCOLS}
+    out, mean_ap = place.output_folder / "quality.json", {protocol: metrics.mean_ap(protocol) for protocol in PROTOCOLS}
     provenance.write_json(out, {"mean_ap": mean_ap, "kinds": metrics.kinds, "intervals": intervals}, options, None)
     console.print(f"All numbers are in {out}", highlight=False, soft_wrap=True)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import tyro
 
@@ -15,8 +14,8 @@ from manyeyes._bounds import LengthM, OutputFile
 class Options:
     """What is written, and as what."""
 
-    folder: tyro.conf.Positional[Path]
-    """The map's folder, of 'map fuse'."""
+    folder: tyro.conf.Positional[str]
+    """The map: the folder of 'map fuse', or a store in a folder or at a URL (s3://bucket/city; city@2 is its release 2)."""
     file: tyro.conf.Positional[OutputFile]
     """The file; .geojson, .gpkg, .parquet, .osm, .pmtiles and .npz name their format, .json needs --format."""
     format: str | None = None

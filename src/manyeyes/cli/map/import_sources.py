@@ -37,16 +37,17 @@ class MapOptions:
     trusted: bool = False
     """Surveyed maps: one of them alone publishes an element."""
     date: str | None = None
-    """When the maps were made, such as 2026-03-01; by default when each file was last changed."""
+    """When the maps were made, such as 2026-03-01; by default when each file was last changed, of a store its last observation."""
 
 
 @dataclass(frozen=True)
 class Options:
     """What is read, and what the file does not say."""
 
-    sources: tyro.conf.Positional[tuple[Path, ...]]
+    sources: tyro.conf.Positional[tuple[str, ...]]
     """Sources: one map or more, of one region: an Argoverse 2 log or its map (.json), Lanelet2 (.osm), GeoPackage (.gpkg), GeoJSON,
-    or a folder of 'map fuse'. Or one result file: nuscmap_results.json of MapTR, submission_vector.json of StreamMapNet."""
+    a folder of 'map fuse', or a store in a folder or at a URL. Or one result file: nuscmap_results.json of MapTR,
+    submission_vector.json of StreamMapNet."""
     poses: Path | None = None
     """A CSV with token, agent, pass_id, time_ns, x, y, yaw and, if known, sigma_x, sigma_y, sigma_yaw."""
     origin: tuple[LatitudeDeg, LongitudeDeg] | None = None
@@ -82,11 +83,11 @@ def main(options: Options) -> None:
     console = Console()
     if not options.sources:
         raise ConfigError("Give one map or more, or a result file of a map model.")
-    of_maps = [path for path in options.sources if is_map(path)]
+    of_maps = [place for place in options.sources if is_map(place)]
     if not of_maps:
         loaded = _read_predictions(options)
     elif len(of_maps) < len(options.sources):
-        other = next(path for path in options.sources if path not in of_maps)
+        other = next(place for place in options.sources if place not in of_maps)
         raise ConfigError(f"{other} is no map, but {of_maps[0]} is one: import maps and result files into two folders.")
     else:
         loaded = _read_maps(options)
@@ -125,6 +126,7 @@ def _read_maps(options: Options) -> LoadedObservations:
     from manyeyes.maps.elements.map_observation import MapSource, make_map_observations
     from manyeyes.maps.elements.observation import MapFrame, Observation
     from manyeyes.maps.elements.observation_file import LoadedObservations
+    from manyeyes.maps.store.map_place import MapPlace
     from manyeyes.studies.map_import import read_source_map
 
     if options.poses is not None or options.nuscenes is not None:
@@ -134,13 +136,13 @@ def _read_maps(options: Options) -> LoadedObservations:
     observations: list[Observation] = []
     left_out: Counter[str] = Counter()
     names = _name_agents(options.sources)
-    for path, name in zip(options.sources, names):
-        source_map = read_source_map(path, frame, choice.crs)
+    for place, name in zip(options.sources, names):
+        source_map = read_source_map(place, frame, choice.crs)
         frame = source_map.frame
-        _check_distance(path, source_map.elements.points)
+        _check_distance(place, source_map.elements.points)
         source = MapSource(
             agent=name,
-            time_ns=_find_time(path, choice.date),
+            time_ns=_find_time(place, choice.date),
             sigma_m=choice.pose_sigma,
             sigma_yaw_rad=math.radians(choice.yaw_sigma_deg),
             score=choice.score,
@@ -148,35 +150,43 @@ def _read_maps(options: Options) -> LoadedObservations:
             trusted=choice.trusted,
         )
         observations += make_map_observations(source_map.elements, source)
-        left_out.update({f"{path.name}: {what}": count for what, count in source_map.left_out.items()})
+        left_out.update({f"{MapPlace.parse(place).name}: {what}": count for what, count in source_map.left_out.items()})
     assert frame is not None
     return LoadedObservations(frame, tuple(observations), (), dict(left_out))
 
 
-def _check_distance(path: Path, points: NDArray[np.float64]) -> None:
+def _check_distance(place: str, points: NDArray[np.float64]) -> None:
     """ConfigError for a map of points (P, 2) beyond the limit of positions; metres from the frame's origin."""
     from manyeyes.maps.elements.observation_limits import LIMITS
 
     reach = float(abs(points).max(initial=0.0))
     if not reach <= LIMITS.max_position_m:
         raise ConfigError(
-            f"{path}: lies {reach / 1e3:,.0f} km from the origin of the maps, at most {LIMITS.max_position_m / 1e3:,.0f} km are "
+            f"{place}: lies {reach / 1e3:,.0f} km from the origin of the maps, at most {LIMITS.max_position_m / 1e3:,.0f} km are "
             "possible. Import maps of one region at a time, or name --origin LATITUDE LONGITUDE in it."
         )
 
 
-def _name_agents(sources: tuple[Path, ...]) -> list[str]:
+def _name_agents(sources: tuple[str, ...]) -> list[str]:
     """Return a pseudonym for each map: its name, numbered where several have one."""
-    names = [path.resolve().stem[:200] or "map" for path in sources]
+    from manyeyes.maps.store.map_place import MapPlace
+
+    names = [Path(MapPlace.parse(place).name).stem[:200] or "map" for place in sources]
     return [name if names.count(name) == 1 else f"{name}-{k + 1}" for k, name in enumerate(names)]
 
 
-def _find_time(path: Path, date: str | None) -> int:
-    """Return nanoseconds since 1970 of a date (UTC), or of the last change of a file."""
+def _find_time(text: str, date: str | None) -> int:
+    """Return nanoseconds since 1970 of a date (UTC), else of the last observation of a store or the last change of a file."""
     from datetime import UTC, datetime
 
+    from manyeyes.maps.store.map_place import MapPlace
+    from manyeyes.studies.map_folder import open_store
+
     if date is None:
-        return path.stat().st_mtime_ns
+        place = MapPlace.parse(text)
+        if place.folder is None or (place.folder / "store.json").is_file():
+            return max(0, open_store(place.location).manifest(place.release).watermark.latest_ns)
+        return place.folder.stat().st_mtime_ns
     try:
         moment = datetime.fromisoformat(date)
     except ValueError:
@@ -216,5 +226,5 @@ def _read_predictions(options: Options) -> LoadedObservations:
     result_options = ModelResultOptions(
         options.axes, options.range_x, options.range_y, options.min_score, model=options.model
     )
-    (source,) = tuple[Path, ...](options.sources)
-    return read_model_results(source, poses, result_options)
+    (source,) = tuple[str, ...](options.sources)
+    return read_model_results(Path(source), poses, result_options)

@@ -44,8 +44,8 @@ def main(options: Options) -> None:
 
     from manyeyes.cli.map.fuse import publish_release
     from manyeyes.maps.store.executors import make_executor
-    from manyeyes.maps.store.store import MapStore, compute_watermark
-    from manyeyes.studies.map_folder import report_rejected
+    from manyeyes.maps.store.store import compute_watermark
+    from manyeyes.studies.map_folder import open_store, report_rejected
 
     selects_by_sender = options.agent is not None or options.pass_id is not None
     if bool(options.ids) == selects_by_sender:
@@ -53,7 +53,7 @@ def main(options: Options) -> None:
     if not options.reason.strip():
         raise ConfigError("--reason is empty; the log records why observations are retracted.")
     executor = make_executor(options.executor, options.workers, options.address)
-    store, console = MapStore(options.store), Console()
+    store, console = open_store(options.store), Console()
 
     def print_status(text: str) -> None:
         console.print(f"{options.store}: {text}", highlight=False, markup=False, soft_wrap=True)
@@ -73,5 +73,5 @@ def main(options: Options) -> None:
         report_rejected(log.rejected[known:], console)
     else:
         print_status(
-            "no new release; run this again without --no-fuse, or 'manyeyes map fuse OBSERVATIONS --store' this folder"
+            "no new release; run this again without --no-fuse, or 'manyeyes map fuse OBSERVATIONS --store' this store"
         )

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from manyeyes.datatypes import ConfigError
 from manyeyes.maps.fusion.coarse_search import CoarseSearchConfig
 
 
@@ -53,8 +54,8 @@ class PoseSolverConfig:
     max_observations_per_cell: observations that count per cell of 8 m, class and heading.
     drive_fraction: fraction of the prior variance that is common to a drive. drift_length_m: distance after which the random
         walk of a drive's bias has that variance again. max_drive_gap_m: longer gaps end a drive.
-    drive_support_m: an observation is shifted by the coarse search only where most of its drive within this distance, which is at
-        most domain_halo_m, are.
+    drive_support_m: an observation is shifted by the coarse search only where most of its drive within this distance are; at most
+        domain_halo_m, since a domain sees no farther.
     domain_m, domain_halo_m: the ground is divided into squares of this side, the origin in the middle of one; the poses in one are
         solved with all that lie within the halo around it, and what lies farther away stays where it is during a step.
     agent_tolerance, agent_scale, max_agent_error: of an agent's mean correction, in standard deviations: up to the first its weight
@@ -99,6 +100,14 @@ class PoseSolverConfig:
     align_prior_scale: float = 3.0
     max_variance_ratio: float = 0.8
     coarse_search: CoarseSearchConfig = field(default_factory=CoarseSearchConfig)
+
+    def __post_init__(self) -> None:
+        if self.drive_support_m > self.domain_halo_m:
+            raise ConfigError(
+                f"PoseSolverConfig: drive_support_m ({self.drive_support_m:g} m) is larger than domain_halo_m "
+                f"({self.domain_halo_m:g} m), beyond which a domain sees no observations of a drive; lower drive_support_m or "
+                "raise domain_halo_m."
+            )
 
     @property
     def schedule(self) -> tuple[SolverStep, ...]:

@@ -310,8 +310,34 @@ def _solve_near(near: PoseSolution, step: SolverStep, config: PoseSolverConfig) 
     if solved.factor is not None:
         marginal = compute_marginal_covariance(solved.factor, len(near.ids))
         marginal[priors.fixed] = near.prior_covariance[priors.fixed]
+        marginal = bound_covariance(marginal, near.prior_covariance, state.correction, step.joint.prior_scale)
         state = replace(state, common_covariance=marginal - state.covariance)
     return state, _make_columns(state, blocks.own, near.pairs, config)
+
+
+def bound_covariance(
+    covariance: Floats, prior_covariance: Floats, correction: Floats, min_sigmas: float
+) -> NDArray[np.float64]:
+    """Bound covariances (O, 3, 3) of poses in each direction by the prior ones, times the square of the corrections in sigmas.
+
+    A robust weight that releases a prior, as of a rejected agent, leaves directions that no line constrains to the inverse of that
+    weight: kilometres. That is a freedom of the system of equations, not an error of the pose, which stays at its prior there.
+
+    Args:
+        covariance, prior_covariance: (O, 3, 3). correction: (O, 3) of the prior poses.
+        min_sigmas: the bound is at least so many standard deviations of the prior.
+    """
+    out = covariance.copy()
+    # Relative to the prior, so that metres and radians compare; L L' is the prior covariance.
+    root = np.linalg.cholesky(prior_covariance)
+    whitening = np.linalg.inv(root)
+    square, axes = np.linalg.eigh(whitening @ covariance @ whitening.transpose(0, 2, 1))
+    limit = np.maximum(min_sigmas**2, (np.einsum("oij,oj->oi", whitening, correction) ** 2).sum(1))[:, None]
+    rows = np.flatnonzero((square > limit).any(1))
+    scaled = root[rows] @ axes[rows]
+    bounded = np.minimum(square, limit)[rows]
+    out[rows] = scaled * bounded[:, None, :] @ scaled.transpose(0, 2, 1)
+    return out
 
 
 def weigh_agents(

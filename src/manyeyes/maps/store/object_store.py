@@ -21,6 +21,7 @@ from typing import IO, Any, Protocol, cast
 from manyeyes._io import atomic_write, remove_unfinished
 from manyeyes.datatypes import ConfigError, ManyeyesError
 from manyeyes.datatypes.extras import import_extra
+from manyeyes.maps.store.map_place import is_url
 
 _READ_AHEAD_BYTES = 1 << 20
 """A segment of a log is read in such parts, as a block needs a few of its groups of rows."""
@@ -217,7 +218,8 @@ class UrlStore:
                 raise
             reason = " ".join(str(error).split()) or type(error).__name__
             raise StoreError(
-                f"{self.url}/{key}: the store cannot be reached; {reason}. Check address, network and credentials."
+                f"{self.url}/{key}: the store cannot be reached; {reason}. Check address, network and credentials"
+                f"{_name_settings(self.url)}."
             ) from None
 
 
@@ -230,9 +232,11 @@ def open_object_store(place: Path | str, options: tuple[tuple[str, str], ...] = 
     return FolderStore(Path(str(place).removeprefix("file://")))
 
 
-def is_url(place: Path | str) -> bool:
-    """Return whether a place is a URL and no folder; ``file://`` is a folder."""
-    return "://" in str(place) and not str(place).startswith("file://")
+def _name_settings(url: str) -> str:
+    """Name what holds the address and the credentials of a store, for messages; empty where that depends on its package."""
+    if not url.startswith(("s3://", "s3a://")):
+        return ""
+    return " (AWS_ENDPOINT_URL where the service is not Amazon's, AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY)"
 
 
 @lru_cache(maxsize=16)

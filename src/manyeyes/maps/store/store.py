@@ -24,19 +24,21 @@ import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.maps.elements.observation import MapFrame
+from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.fusion.fuse import MapFusionConfig
 from manyeyes.maps.isolation import FailedObservationsError
 from manyeyes.maps.store.executors import Executor, ProcessExecutor, map_blocks
+from manyeyes.maps.store.log_index import ActiveObservations
 from manyeyes.maps.store.map_diff import MapDelta
 from manyeyes.maps.store.object_store import FolderStore, ObjectNotFoundError, StoreError, open_object_store
-from manyeyes.maps.store.observation_log import ObservationLog
+from manyeyes.maps.store.observation_log import ObservationLog, read_active
 from manyeyes.maps.store.releases import STORE_VERSION, Manifest, ReleaseStore, Watermark, read_json
 from manyeyes.maps.store.tiled_fusion import (
     ALGORITHM,
@@ -68,10 +70,13 @@ class MapStore:
             )
         self.frame = MapFrame(content["latitude"], content["longitude"])
         self.published = ReleaseStore(self.objects, self.frame)
+
+    @cached_property
+    def log(self) -> ObservationLog:
+        """The log of observations; readers of releases need none, and so no index."""
         if isinstance(self.objects, FolderStore):
-            self.log = ObservationLog(self.objects, self.frame, self.objects.folder / "catalogue.sqlite")
-        else:
-            self.log = ObservationLog(self.objects, self.frame, _cached_index(location), index_is_cache=True)
+            return ObservationLog(self.objects, self.frame, self.objects.folder / "catalogue.sqlite")
+        return ObservationLog(self.objects, self.frame, _cached_index(self.objects.location), index_is_cache=True)
 
     @classmethod
     def create(cls, place: Path | str, frame: MapFrame, options: tuple[tuple[str, str], ...] = ()) -> MapStore:
@@ -100,6 +105,18 @@ class MapStore:
         with self.objects.hold_lock():
             self.log.recover()
             yield self.log
+
+    def observations_of(self, number: int | None = None) -> list[Observation]:
+        """Return the observations that a release was made of, the last one if no number is given, ids ascending.
+
+        Where no beginning of the log has the watermark of the release, as after a retraction: all that count now.
+        """
+        if not isinstance(self.objects, FolderStore):
+            # The index is this user's own; another program may have written to the log.
+            self.log.recover()
+        active = self.log.active_observations()
+        rows = _find_rows(active, self.manifest(number).watermark)
+        return read_active(self.objects, active, np.arange(len(active)) if rows is None else rows)
 
     def releases(self) -> tuple[int, ...]:
         """Return numbers of all releases, ascending."""
@@ -182,6 +199,16 @@ def _write_release(part: _Release) -> Manifest:
     """Link the stations of all blocks and write the tiles."""
     fused = assemble_stations(part.job, part.stations, part.published.frame)
     return part.published.write(fused, ALGORITHM, repr(part.job.config), part.watermark)
+
+
+def _find_rows(active: ActiveObservations, watermark: Watermark) -> NDArray[np.int64] | None:
+    """Return the rows of the first segments of a log whose observations have this watermark; None where there are none such."""
+    for last in range(len(active.segments), -1, -1):
+        rows = np.flatnonzero(active.segment < last)
+        if len(rows) == watermark.observations:
+            found = compute_watermark([active.ids[row] for row in rows.tolist()], active.time_ns[rows])
+            return rows if found == watermark else None
+    return None
 
 
 def compute_watermark(ids: Sequence[str], times_ns: NDArray[np.int64]) -> Watermark:
