@@ -3,11 +3,11 @@
 
 python scripts/fusion_runs.py --data FOLDER --out runs/fusions [--seeds 5 6 7] [--stage-c fast v2vnet] [--hours 8] [--jobs 2]
 
-Order: the base (stage-a); every fusion inside with the first seed; six bare ones; the other seeds, fusion by fusion; the rows of
-CoSTr's Table III that are no run of before, each after its base; the other bare ones; stage C, 10,000 steps from nothing. A run has
-a folder OUT/NAME/seed-N, and is finished when its weights.safetensors is there. The same command goes on after it was stopped, in
-the middle of a run too. OUT/runs.json says which runs are finished, failed or left, and how long they took. A failed run does not
-stop the others; those that start from it are left.
+Order: the base (stage-a); every fusion inside with the first seed; six bare ones; early fusion; the other seeds, fusion by
+fusion; the rows of CoSTr's Table III that are no run of before, each after its base; the other bare ones; stage C, 10,000 steps
+from nothing. A run has a folder OUT/NAME/seed-N, and is finished when its weights.safetensors is there. The same command goes on
+after it was stopped, in the middle of a run too. OUT/runs.json says which runs are finished, failed or left, and how long they
+took. A failed run does not stop the others; those that start from it are left.
 """
 
 from __future__ import annotations
@@ -62,6 +62,7 @@ def make_runs(seeds: Sequence[int], stage_c: Sequence[str] = ()) -> list[Run]:
     runs = [Run("stage-a", first, None)]
     runs += [Run(f"fusion/{name}", first) for name in INSIDE_FUSIONS]
     runs += [Run(f"fusion/{name}/bare", first) for name in FIRST_BARE]
+    runs.append(Run("early", first))
     runs += [Run(f"fusion/{name}", seed) for name in INSIDE_FUSIONS for seed in others]
     bases = {"stage-a"}
     for name, row in TABLE3_ROWS.items():

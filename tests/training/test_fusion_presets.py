@@ -13,6 +13,7 @@ from manyeyes.models.detector.detector import Detector
 from manyeyes.models.fusion.registry import list_fusion_modules
 from manyeyes.training.detector.fusion_presets import (
     BARE_FUSIONS,
+    EARLY_TRAINING_PRESETS,
     FUSION_PLANS,
     FUSION_TRAINING_PRESETS,
     INSIDE_FUSIONS,
@@ -53,6 +54,12 @@ def test_presets_differ_in_the_fusion_alone() -> None:
         assert config.degradation == replace(reference.degradation, ego_history=0)
         rest = replace(config, degradation=reference.degradation, detector=reference.detector)
         assert rest == reference
+
+
+def test_early_fusion_has_the_recipe_of_the_others_on_merged_clouds() -> None:
+    reference, config = FUSION_TRAINING_PRESETS["fusion/fast"], EARLY_TRAINING_PRESETS["early"]
+    assert config.augment.early_fusion_prob == 0.8 > 2 * reference.augment.early_fusion_prob
+    assert replace(config, augment=reference.augment) == reference
 
 
 @pytest.mark.parametrize("preset", [name for name in FUSION_TRAINING_PRESETS if not name.startswith("stage-c/")])
