@@ -407,7 +407,8 @@ def test_an_invalid_retraction_is_one_line_and_changes_nothing(words, named, sto
 def test_retract_needs_a_store_and_a_reason(store, tmp_path, capsys) -> None:
     assert retract(tmp_path / "nowhere", "--ids", "ab", "--reason", "x") == 1
     (output,) = capsys.readouterr().err.splitlines()
-    assert "nowhere/store.json" in output and not (tmp_path / "nowhere").exists()
+    assert "nowhere: there is no store of maps" in output and "manyeyes map fuse OBSERVATIONS --store" in output
+    assert not (tmp_path / "nowhere").exists()
     assert retract(store, "--ids", "ab", "--reason", " ") == 1
     assert "--reason" in capsys.readouterr().err
     assert retract(store, "--ids", "ab") == 2
