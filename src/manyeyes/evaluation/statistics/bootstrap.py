@@ -71,10 +71,10 @@ def weighted_ap(pool: PooledMatches, weights: np.ndarray) -> np.ndarray:
     start = pool.group_start
     last = np.arange(len(pool.tp)) if start is None else np.append(start[1:], len(pool.tp))[: len(start)] - 1
     # Of several copies of the first detection only the first is left out, unless copies are one step.
-    drop_first = 0 if not pool.drop_first_segment else 1 if start is None else 2
+    max_dropped = 0 if not pool.drop_first_segment else 1 if start is None else np.iinfo(np.int64).max
     tp, row = np.ascontiguousarray(pool.tp, np.bool_), np.ascontiguousarray(pool.scenario_row, np.int64)
     n_gt, drawn = np.ascontiguousarray(pool.n_gt, np.int64), np.ascontiguousarray(weights, np.int64)
-    return resample_ap(tp, row, last, n_gt, drawn, drop_first)
+    return resample_ap(tp, row, last, n_gt, drawn, max_dropped)
 
 
 def weighted_recall(pool: PooledMatches, weights: np.ndarray) -> np.ndarray:
