@@ -19,6 +19,8 @@ export MANYEYES_TOWNS ?= $(abspath $(MAPS)/carla_opendrive)
 endif
 export PYTHONWARNINGS := ignore:::pip
 export OMP_NUM_THREADS ?= 1
+# Without kept bytecode every process compiles every module that it imports; tests start hundreds of processes.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help venv demo test test-fast test-nightly probes coverage mutants check docs wheel wheels format bench clean
 .DEFAULT_GOAL := help
