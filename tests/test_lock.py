@@ -62,10 +62,15 @@ def test_a_new_folder_that_stays_empty_is_removed_and_an_old_one_is_not(tmp_path
 
 
 def test_folders_are_held_one_after_another_and_beside_each_other(tmp_path: Path) -> None:
+    locks = [tmp_path / LOCK, tmp_path / "below" / LOCK]
     with hold_folder(tmp_path), hold_folder(tmp_path / "below"):
-        pass
+        assert [path.read_text().split(" on ")[0] for path in locks] == [f"process {os.getpid()}"] * 2
+        with pytest.raises(FolderInUseError), hold_folder(tmp_path / "below"):
+            pass
+    assert not list(tmp_path.iterdir())
     with hold_folder(tmp_path):
-        pass
+        assert locks[0].exists() and not locks[1].exists()
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_lock_of_a_folder_that_was_removed_leaves_that_of_the_next_holder(tmp_path: Path) -> None:

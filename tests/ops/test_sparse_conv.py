@@ -91,6 +91,8 @@ def test_submanifold_is_the_masked_dense_convolution(kernel, dilation, density):
         weights(4, 3, kernel, kernel),
         weights(4, seed=2),
     )
+    found = submanifold_conv(x, weights(4, 3, kernel, kernel), None, dilation)
+    assert torch.equal(found.sites.key, x.sites.key) and found.features.shape == (len(x.sites), 4)
 
 
 def test_submanifold_in_float32():
@@ -231,6 +233,12 @@ def brute_pool(f: Tensor, table: Tensor) -> Tensor:
     return padded[table.long()].amax(1)
 
 
+def has_ties(f: Tensor, table: Tensor) -> bool:
+    """Whether two cells of one window share its maximum."""
+    padded = torch.cat((f, f.new_full((1, f.shape[1]), -torch.inf)))[table.long()]
+    return bool(((padded == padded.amax(1, keepdim=True)).sum(1) > 1).any())
+
+
 def test_pools_take_active_cells_only_even_when_all_are_negative():
     x = scene(0.3)
     x = x.with_features(-x.features.abs() - 1)
@@ -251,8 +259,10 @@ def test_pool_gradients_are_shared_among_ties():
     x = scene(0.5)
     coarse = torch.randint(0, 3, x.features.shape, generator=torch.Generator().manual_seed(0)).double()
     table = same_sites_map(x.sites, 3).index
+    assert has_ties(coarse, table)
     compare(lambda f: max_pool(x.with_features(f)).features, lambda f: brute_pool(f, table), coarse)
     table = strided_map(x.sites, Window(3, 2, 1))[1].index
+    assert has_ties(coarse, table)
     compare(lambda f: strided_max_pool(x.with_features(f)).features, lambda f: brute_pool(f, table), coarse)
 
 
