@@ -52,6 +52,20 @@ def run(capsys, *words) -> tuple[int, str]:
     return code, captured.out + captured.err
 
 
+@pytest.mark.parametrize("varies", [False, True])
+def test_clouds_without_intensities_are_named(tmp_path, weights, capsys, varies):
+    writer = Opv2vWriter(tmp_path / "a")
+    snapshot = street("a", 0)
+    frames = tuple(
+        replace(f, points=PointCloud.of(f.points.xyz, torch.linspace(0, 1, len(f.points.xyz)) * varies))
+        for f in snapshot.frames
+    )
+    writer.write(Snapshot(snapshot.scenario, 0, frames, snapshot.truth))
+    writer.close({"history_frames": 0})
+    code, text = run(capsys, "check", tmp_path, "--weights", weights)
+    assert code == 0 and ("all intensities are equal" in text) is not varies
+
+
 def test_a_recording_is_described(tmp_path, weights, capsys):
     root = write(tmp_path)
     code, text = run(capsys, "check", root, "--weights", weights, "--out", tmp_path / "check.json")

@@ -84,6 +84,8 @@ def _describe(found: RecordingCheck, missing: MissingFiles, summary: tuple[str, 
         sensors = [sensor for sensor in found.sensors if sensor.is_infrastructure is infrastructure]
         if sensors:
             yield _describe_sensors(sensors, "roadside units" if infrastructure else "vehicles")
+    if found.sensors and all(s.sweep.num_intensity_levels <= 1 for s in found.sensors):
+        yield "all intensities are equal: the clouds store none, and the shipped weights then find much less"
 
 
 def _describe_sensors(sensors: list[AgentSensor], kind: str) -> str:

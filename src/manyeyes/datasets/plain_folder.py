@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A plain folder of clouds with a table of poses for each agent: the layout for data that is in no published one.
 
-``<scenario>/<agent>/poses.csv`` and ``<scenario>/<agent>/clouds/<timestamp_ns>.bin`` (or ``.pcd``, ``.npz``); an agent is named by
-its number, a roadside unit by a negative one. One agent alone may lie in the scenario's folder itself. Columns of ``poses.csv``:
-``timestamp_ns``, ``x``, ``y``, ``z`` and ``qw``, ``qx``, ``qy``, ``qz`` or ``roll``, ``pitch``, ``yaw`` (radians, R = Rz Ry Rx):
-world from LiDAR, right-handed, metres. Optional: ``cloud`` (a file in the agent's folder), ``speed_mps``, ``sensor_height_m``, and
+``<scenario>/<agent>/poses.csv`` and ``<scenario>/<agent>/clouds/<timestamp_ns>.bin`` (``.pcd``, ``.npz``, ``.npy``); an agent is
+named by its number, a roadside unit by a negative one. One agent alone may lie in the scenario's folder itself. Columns of
+``poses.csv``: ``timestamp_ns``, ``x``, ``y``, ``z`` and ``qw``, ``qx``, ``qy``, ``qz`` or ``roll``, ``pitch``, ``yaw``
+(radians, R = Rz Ry Rx): world from LiDAR, right-handed, metres. Optional: ``cloud`` (a file in the agent's folder),
+``speed_mps``, ``sensor_height_m``, and
 ``body_x``, ``body_y``, ``body_length``, ``body_width``, ``body_height`` (of the vehicle's own body, its middle ahead and to the
 left of the LiDAR).
 
@@ -80,7 +81,7 @@ class AgentTable:
 @register_dataset(
     "folder",
     matches=contains_agents,
-    layout=f"<scenario>/<agent>/{POSES} and {CLOUDS}/<timestamp_ns>.bin, .pcd or .npz",
+    layout=f"<scenario>/<agent>/{POSES} and {CLOUDS}/<timestamp_ns>.bin, .pcd, .npz or .npy",
 )
 class FolderRecording(RecordingReader):
     """Scenarios of plain folders under a root: several, in a split, or one.

@@ -63,7 +63,12 @@ def make_operating_table(rows: Sequence[OperatingRow]) -> RenderableType:
     headings, *lines = format_operating_lines(rows)
     has_classes = len(headings) > len(HEADINGS)
     body = [[split_intervals(cell) for cell in line] for line in lines]
-    return make_table(TITLE, [h.replace("/", "/\n") for h in headings], body, num_left=2 if has_classes else 1)
+    return make_table(
+        TITLE,
+        [h.replace("/", "/\n").replace("legacy ", "legacy\n") for h in headings],
+        body,
+        num_left=2 if has_classes else 1,
+    )
 
 
 def format_operating_markdown(rows: Sequence[OperatingRow], score_threshold: float) -> str:

@@ -44,6 +44,17 @@ def test_arrays_of_an_npz_archive(tmp_path: Path, arrays: dict[str, np.ndarray],
     assert cloud.xyz.tolist() == XYZ.tolist() and cloud.intensity.tolist() == pytest.approx(expected)
 
 
+def test_an_array_of_numpy_has_three_or_four_columns(tmp_path: Path) -> None:
+    np.save(tmp_path / "0.npy", np.concatenate((XYZ, [[0.1], [0.2], [0.3]]), 1))
+    np.save(tmp_path / "1.npy", XYZ)
+    np.save(tmp_path / "2.npy", XYZ[:, :2])
+    bright, plain = read_cloud(tmp_path / "0.npy"), read_cloud(tmp_path / "1.npy")
+    assert bright.xyz.tolist() == plain.xyz.tolist() == XYZ.tolist()
+    assert bright.intensity.tolist() == pytest.approx([0.1, 0.2, 0.3]) and plain.intensity.tolist() == [0, 0, 0]
+    with pytest.raises(RecordingError, match=r"found float32 \(3, 2\)"):
+        read_cloud(tmp_path / "2.npy")
+
+
 def test_a_pcd_file_is_read_by_its_suffix(tmp_path: Path) -> None:
     write_pcd(tmp_path / "0.pcd", XYZ, np.array([0, 0.2, 1]))
     assert read_cloud(tmp_path / "0.pcd").xyz.tolist() == XYZ.tolist()
@@ -61,7 +72,8 @@ def test_points_that_are_nan_are_an_error_or_dropped(tmp_path: Path) -> None:
     [
         ("0.bin", b"12345", "multiple of 16"),
         ("0.npz", b"no archive", "archive of numpy arrays"),
-        ("0.las", b"", "ends with .bin, .pcd, .npz"),
+        ("0.las", b"", "ends with .bin, .pcd, .npz, .npy"),
+        ("0.npy", b"no array", "expected an array of numpy"),
     ],
 )
 def test_damaged_files_are_named(tmp_path: Path, name: str, data: bytes, text: str) -> None:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds without a header: ``.bin`` files of float32 x, y, z, intensity, as KITTI and V2X-Real have them; and ``.npz`` archives.
+"""Clouds without a header: ``.bin`` files of float32 x, y, z, intensity, as KITTI and V2X-Real have them; and numpy's
+``.npz`` archives and ``.npy`` arrays.
 
 An intensity that exceeds 1 anywhere in a file counts to 255. Points are in the file's own frame.
 """
@@ -16,7 +17,7 @@ from manyeyes._io import MAX_FILE_BYTES, read_file, unpack_zip_member
 from manyeyes.datasets.formats.pcd import PcdCloud, read_pcd
 from manyeyes.datatypes import RecordingError
 
-SUFFIXES = (".bin", ".pcd", ".npz")
+SUFFIXES = (".bin", ".pcd", ".npz", ".npy")
 _REMEDY = "copy or download the file again"
 
 
@@ -26,7 +27,7 @@ def read_cloud(path: Path, drop_nan: bool = False) -> PcdCloud:
     Raises:
         RecordingError: the file is missing, damaged or of another type, or a point is NaN and drop_nan is False.
     """
-    readers = {".bin": read_bin, ".pcd": read_pcd, ".npz": read_npz}
+    readers = {".bin": read_bin, ".pcd": read_pcd, ".npz": read_npz, ".npy": read_npy}
     if path.suffix not in readers:
         raise RecordingError(
             f"{path}: expected a cloud that ends with {', '.join(SUFFIXES)}; convert it to one of them."
@@ -61,6 +62,24 @@ def read_npz(path: Path, drop_nan: bool = False) -> PcdCloud:
         raise RecordingError(
             f"{path}: expected an archive of numpy arrays, found something else ({error}); {_REMEDY}."
         ) from None
+    return _make_array_cloud(path, points, intensity, drop_nan)
+
+
+def read_npy(path: Path, drop_nan: bool = False) -> PcdCloud:
+    """Read one array of points: (N, 3), metres, or (N, 4) with their intensities."""
+    try:
+        points = np.load(io.BytesIO(_read(path, "an array of numpy")), allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise RecordingError(
+            f"{path}: expected an array of numpy, found something else ({error}); {_REMEDY}."
+        ) from None
+    if not isinstance(points, np.ndarray):
+        raise RecordingError(f"{path}: expected an array of numpy, found an archive; name it .npz.")
+    return _make_array_cloud(path, points, None, drop_nan)
+
+
+def _make_array_cloud(path: Path, points: np.ndarray, intensity: np.ndarray | None, drop_nan: bool) -> PcdCloud:
+    """Check points (N, 3) or (N, 4) and intensities (N,), and make a cloud of them."""
     if points.ndim != 2 or points.shape[1] not in (3, 4) or points.dtype.kind not in "fiu":
         raise RecordingError(
             f"{path}: expected 'points' (N, 3) or (N, 4) of numbers, found {points.dtype} {points.shape}; save such an array."
