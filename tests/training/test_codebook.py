@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fitting a codebook: centres by hand, the same for the same seed, kept by files, named by the fingerprint."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -104,3 +106,9 @@ def test_fit_without_tokens_is_refused(detector, toy):
     blind.eval().requires_grad_(False).token_prune.score.bias.fill_(-100.0)
     with pytest.raises(ConfigError, match="no codebook can be fitted"):
         fit_codebook(blind, empty)
+
+
+def test_fit_of_a_fusion_without_proposals_is_refused_before_any_frame(detector, toy):
+    bare = Detector(replace(detector.config, fusion="max/bare"))
+    with pytest.raises(ConfigError, match="max/bare sends features without proposals: it has no codebook; use float16"):
+        fit_codebook(bare, toy(), report=lambda progress: pytest.fail("a frame was begun"))

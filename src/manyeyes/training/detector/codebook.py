@@ -126,7 +126,14 @@ def fit_codebook(
     """Fit a codebook to every frame_stride-th evaluated frame; returns the detector with it, under a new fingerprint.
 
     report: called before the first frame, and after every one.
+
+    Raises:
+        ConfigError: the fusion sends features without proposals and so has no codebook, or no agent shares a token.
     """
+    if detector.is_bare:
+        raise ConfigError(
+            f"Fusion {detector.config.fusion} sends features without proposals: it has no codebook; use float16."
+        )
     rows: list[Tensor] = []
     frames = _select_frames(recording, frame_stride)
     report(CollectionProgress(0, len(frames), 0))
