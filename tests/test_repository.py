@@ -6,6 +6,7 @@ from __future__ import annotations
 import ast
 import json
 import re
+import subprocess
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,19 @@ def test_the_citation_names_version_and_licence_of_the_package() -> None:
 @pytest.mark.parametrize("path", [*FILES, *WORKFLOWS], ids=lambda path: path.name)
 def test_no_address_of_a_person_or_machine_is_named(path: Path) -> None:
     assert re.findall(r"[\w.+-]+@[\w-]+\.\w+|https?://\S+", path.read_text(encoding="utf-8")) == []
+
+
+def test_no_tracked_link_leaves_the_repository() -> None:
+    """A link to a folder of one machine dangles in every other clone, and nothing can be written below it."""
+    if not (ROOT / ".git").exists():
+        pytest.skip("no checkout: there is nothing tracked")
+    listing = subprocess.run(
+        ["git", "ls-files", "-s", "-z"], cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout
+    entries = [line.partition("\t") for line in listing.split("\0") if line]
+    links = [ROOT / path for mode, _, path in entries if mode.startswith("120000")]
+    outside = [link for link in links if not link.resolve().is_relative_to(ROOT)]
+    assert len(entries) > 100 and outside == []
 
 
 def test_workflows_run_targets_of_the_makefile_on_every_python() -> None:
