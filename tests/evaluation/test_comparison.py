@@ -1,20 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """Hand-made steps, counted, and differences of hand-made results."""
 
+import io
 import math
 from dataclasses import replace
 
 import pytest
 import torch
+from rich.console import Console
 
 from manyeyes.agents.agent import Perception
 from manyeyes.agents.replay import ReplayStep, SentPackets
 from manyeyes.datatypes import CLASSES, LABELS, AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.evaluation.detection.accumulator import MethodResult, MetricAccumulator
 from manyeyes.evaluation.detection.average_precision import PROTOCOLS
+from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.evaluation.statistics.comparison import compare_methods
 from manyeyes.evaluation.statistics.operating_point import OperatingThreshold
-from manyeyes.viz.operating_table import format_operating_lines, format_operating_note, make_operating_rows
+from manyeyes.viz.operating_table import (
+    TITLE,
+    OperatingRow,
+    format_operating_lines,
+    format_operating_note,
+    make_operating_rows,
+    make_operating_table,
+)
 from manyeyes.viz.table import HEADINGS, format_lines, make_row
 
 PROTOCOL = PROTOCOLS["global-sort"]
@@ -134,3 +144,28 @@ def test_one_class_has_no_column() -> None:
     assert "chosen for no method" in format_operating_note(rows, 0.05) and "above 0.05" in format_operating_note(
         rows, 0.05
     )
+
+
+def test_the_operating_table_of_one_drive_fits_80_columns_without_cut_words() -> None:
+    """Intervals of one scenario are left out; the longest method is late-weighted-temporal."""
+    exact = Interval(0.5, math.nan, math.nan, 0.95, 1)
+    (row,) = make_operating_rows([accumulate("late", [2, 4])])
+    point = replace(
+        row.point,
+        precision=exact,
+        recall=exact,
+        f_score=exact,
+        false_alarms_per_frame=exact,
+        duplicates_per_object=exact,
+    )
+    row = OperatingRow("late-weighted-temporal", "vehicle", point, (exact, exact))
+    console = Console(width=80, file=io.StringIO())
+    console.print(make_operating_table([row]))
+    assert isinstance(console.file, io.StringIO)
+    text = console.file.getvalue()
+    parts = (
+        "method thresh- old preci- sion recall F false alarms /frame dupli- cates /object legacy AP@0.5 legacy AP@0.7"
+    )
+    heading = text[: text.index("─")].removeprefix(f"{TITLE}").split()
+    assert sorted(heading) == sorted(parts.split())
+    assert text.count("late-weighted-temporal") == 1 and max(map(len, text.splitlines())) <= 80

@@ -210,6 +210,40 @@ def test_a_page_without_a_player_shows_its_plots(page: Browser, tmp_path: Path) 
     page.session = first
 
 
+def test_names_of_neighbouring_points_are_whole_and_cover_neither_points_nor_names(
+    page: Browser, tmp_path: Path
+) -> None:
+    values = {
+        "no-fusion-temporal": (0.592, 0.0),
+        "late-temporal": (0.975, 1819.0),
+        "intermediate-temporal": (0.988, 2509.0),
+        "early-temporal": (0.976, 95661.0),
+    }
+    rows = tuple(
+        MethodRow(name, Interval(ap, math.nan, math.nan, 0.95, 1), None, num_bytes, None, None, None)
+        for name, (ap, num_bytes) in values.items()
+    )
+    save_report(HtmlReport("A split", "Neighbours.", rows), tmp_path / "names.html")
+    first = page.session
+    page.open((tmp_path / "names.html").as_uri())
+    drawn = page.value(
+        "(() => { const drawn = [], names = held.methods.map((m) => m.label), kind = CanvasRenderingContext2D.prototype;"
+        "const { fillText, arc } = kind; kind.fillText = function (text, x, y) { if (names.includes(text)) {"
+        "const width = this.measureText(text).width, left = this.textAlign === 'right' ? x - width : x;"
+        "drawn.push([left, y - 9, left + width, y + 1]); } };"
+        "kind.arc = function (x, y, r) { drawn.push([x - r, y - r, x + r, y + r]); };"
+        "drawBytes(); Object.assign(kind, { fillText, arc }); return drawn; })()"
+    )
+    page.session = first
+    assert len(drawn) == 2 * len(values)
+    assert min(top for _, top, _, _ in drawn) >= 0
+    for number, one in enumerate(drawn):
+        for other in drawn[number + 1 :]:
+            is_point = [box[2] - box[0] == 10.0 for box in (one, other)]
+            apart = one[2] <= other[0] or other[2] <= one[0] or one[3] <= other[1] or other[3] <= one[1]
+            assert apart or all(is_point), (one, other)
+
+
 @pytest.mark.parametrize("size", [WIDE, NARROW])
 def test_differences_are_drawn_with_their_intervals_filled_where_resolved(
     page: Browser, tmp_path: Path, size: tuple[int, int]

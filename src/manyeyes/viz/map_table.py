@@ -16,7 +16,7 @@ PROTOCOLS = {"exact": "Chamfer-exact", "maptr": "MapTR", "streammapnet": "Stream
 
 
 def make_kinds_table(metrics: MapMetrics, title: str) -> RenderableType:
-    """Tabulate one map: a column for each kind that is predicted or true, and one for the mean over kinds."""
+    """Tabulate one map: a column for each kind that is predicted or true, and one for the mean of crossings and dividers."""
     kinds = [k for k in metrics.kinds if k.n_predicted or k.n_truth]
     lines = [
         (f"AP {name}", *(_format_number(metrics.get_ap(k.kind, protocol)) for k in kinds), _format_number(mean))
@@ -31,7 +31,7 @@ def make_kinds_table(metrics: MapMetrics, title: str) -> RenderableType:
     ):
         lines.append((heading, *(_format_number(value, 3 if heading.startswith("F1") else 2) for value in values), ""))
     lines.append(("predicted/true elements", *(f"{k.n_predicted}/{k.n_truth}" for k in kinds), ""))
-    return make_table(title, ("metric", *(k.kind for k in kinds), "mean"), lines)
+    return make_table(title, ("metric", *(k.kind for k in kinds), "crossing and divider"), lines)
 
 
 def make_change_table(changes: Sequence[KindChange], title: str) -> RenderableType:

@@ -22,6 +22,15 @@ SOURCES = {
 HEADINGS = (
     "method", "threshold", "precision", "recall", "F", "false alarms/frame", "duplicates/object", "legacy AP@0.5", "legacy AP@0.7",
 )  # fmt: skip
+_NARROW_HEADINGS = {
+    "threshold": "thresh-\nold",
+    "precision": "preci-\nsion",
+    "false alarms/frame": "false\nalarms\n/frame",
+    "duplicates/object": "dupli-\ncates\n/object",
+    "legacy AP@0.5": "legacy\nAP@0.5",
+    "legacy AP@0.7": "legacy\nAP@0.7",
+}
+"""Broken where they may be, so that methods and values without intervals fit 80 columns."""
 TITLE = "At one score threshold, IoU 0.5"
 
 
@@ -65,7 +74,7 @@ def make_operating_table(rows: Sequence[OperatingRow]) -> RenderableType:
     body = [[split_intervals(cell) for cell in line] for line in lines]
     return make_table(
         TITLE,
-        [h.replace("/", "/\n").replace("legacy ", "legacy\n") for h in headings],
+        [_NARROW_HEADINGS.get(heading, heading) for heading in headings],
         body,
         num_left=2 if has_classes else 1,
     )

@@ -29,7 +29,7 @@ COLUMN_DESCRIPTIONS = {
     "sender's points": "median returns on the vehicle",
     "ego's points": "median returns on the vehicle",
     "map": "what is compared",
-    "mAP": "average precision of lines at three distances, mean over kinds",
+    "mAP": "average precision of lines at three distances, mean of crossings and dividers",
     "precision": "length of drawn dividers that lies on true ones",
     "F1": "harmonic mean of precision and recall of dividers",
     "duplication": "lines drawn for each true divider; 1 is right",

@@ -63,7 +63,7 @@ function drawBytes() {
   }
   pen.fillText("none", toX(0), bottom + 16);
   pen.fillText("bytes of a message", (left + right) / 2, bottom + 34);
-  const taken = [];
+  const taken = rows.map((m) => ({ y: toY(m.ap) + 4, start: toX(m.bytes) - 6, end: toX(m.bytes) + 6 }));
   rows.forEach((m) => {
     const x = toX(m.bytes), y = toY(m.ap);
     pen.strokeStyle = pen.fillStyle = methodColour(uniqueNames.indexOf(m.name));
@@ -72,7 +72,7 @@ function drawBytes() {
     const length = pen.measureText(m.label).width, onLeft = x + 10 + length > right;
     pen.textAlign = onLeft ? "right" : "left";
     const start = onLeft ? x - 10 - length : x + 10;
-    const isFree = (at) => taken.every((t) => Math.abs(t.y - at) >= 13 || start >= t.end || t.start >= start + length);
+    const isFree = (at) => at >= 10 && taken.every((t) => Math.abs(t.y - at) >= 13 || start >= t.end || t.start >= start + length);
     const at = [4, -10, 18, -24, 32, 46].map((offset) => y + offset).find(isFree) ?? y + 60;
     taken.push({ y: at, start, end: start + length });
     pen.fillText(m.label, onLeft ? x - 10 : x + 10, at);
