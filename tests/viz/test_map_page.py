@@ -4,6 +4,7 @@
 import json
 import re
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from tests.viz.chromium import Browser, find_program
 
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
 from manyeyes.evaluation.maps.map_discrepancy import MapDiscrepancy
-from manyeyes.viz.map_page import MapPage, render, save_map_page, to_lonlat
+from manyeyes.viz.map_page import CHANGE_NAMES, MapPage, render, save_map_page, to_lonlat
 
 CONFIDENT, UNCERTAIN, MISSED = (12, 44, 132), (215, 48, 31), (243, 132, 186)
 
@@ -57,6 +58,28 @@ def test_north_is_up_east_is_right_and_a_metre_is_a_metre() -> None:
     assert got[0] == pytest.approx([8.4, 49.0], abs=1e-12)
     assert got[1] - got[0] == pytest.approx([100 / (111_319.49 * np.cos(np.radians(49)) * 1.001909), 0], abs=2e-7)
     assert got[2] - got[0] == pytest.approx([0, 100 / 111_207], abs=2e-7)
+
+
+@pytest.mark.parametrize(
+    ("changes", "headings"),
+    [
+        ({}, ["Confidence of fused elements", "Truth and observations", "Disagreement"]),
+        ({"truth": None, "discrepancy": MapDiscrepancy()}, ["Confidence of fused elements", "Observations"]),
+        ({"truth": None, "observed": None, "discrepancy": MapDiscrepancy()}, ["Confidence of fused elements"]),
+        (
+            {"observed": None, "names": CHANGE_NAMES},
+            ["Confidence of fused elements", "Old map", "Changes"],
+        ),
+    ],
+)
+def test_the_legend_explains_what_the_page_holds(changes, headings) -> None:
+    page = render(replace(made_page(), **changes))
+    legend = page[page.index('<div class="legend">') : page.index('<script type="application/json"')]
+    assert re.findall("<b>(.*?)</b>", legend) == headings
+    names = re.findall("</i>(.*?)</span>", legend)
+    kinds = ["divider", "boundary", "crossing", "stop line"] if len(headings) > 1 else []
+    disagreements = {"Disagreement": ["false negatives"], "Changes": ["gone"]}.get(headings[-1], [])
+    assert names == kinds + disagreements
 
 
 def test_a_map_without_anything_is_a_page(tmp_path) -> None:

@@ -126,7 +126,7 @@ def render(page: MapPage) -> str:
             f"<title>{_text(page.title)}</title>",
             f"<style>{read_asset('vendor/maplibre-gl.css')}</style><style>{read_asset('web/map_page.css')}</style></head><body>",
             f'<div id="map"></div><div id="panel"><h1>{_text(page.title)}</h1><ul class="facts">{facts}</ul>',
-            f'<div id="layers"></div>{_legend(names)}</div>',
+            f'<div id="layers"></div>{_legend(page, names)}</div>',
             f'<script type="application/json" id="data">{to_safe_json(data)}</script>',
             f"<script>{read_asset('vendor/maplibre-gl.js')}</script>",
             f"<script>{read_asset('web/map_page.js')}</script></body></html>\n",
@@ -177,19 +177,33 @@ def _bounds(page: MapPage) -> list[list[float]]:
     return to_lonlat(np.stack((points.min(0), points.max(0))), page.origin).tolist()
 
 
-def _legend(names: dict[str, str]) -> str:
+def _legend(page: MapPage, names: dict[str, str]) -> str:
+    """Explain the colours of what the page holds."""
     stops = ", ".join(f"{colour} {100 * at:g}%" for at, colour in CONFIDENCE_STOPS)
-    kinds = "".join(
-        f'<span><i style="background:{c}"></i>{k.replace("_", " ")}</span>' for k, c in KIND_COLOURS.items()
-    )
-    discrepancy_items = "".join(
-        f'<span><i style="background:{c}"></i>{names.get(k, k)}</span>' for k, c in DISCREPANCY_COLOURS.items()
-    )
-    return (
-        f'<div class="legend"><b>Confidence of fused elements</b><div class="bar" style="background:linear-gradient(90deg, '
-        f'{stops})"></div><div class="ends"><span>0</span><span>1</span></div><b>Truth and observations</b>'
-        f"<div>{kinds}</div><b>Disagreement</b><div>{discrepancy_items}</div></div>"
-    )
+    parts = [
+        f'<b>Confidence of fused elements</b><div class="bar" style="background:linear-gradient(90deg, {stops})"></div>'
+        '<div class="ends"><span>0</span><span>1</span></div>'
+    ]
+    shown = [names.get(name, title) for name, title, held in (
+        ("truth", "Truth", page.truth), ("observed", "observations", page.observed),
+    ) if held is not None]  # fmt: skip
+    if shown:
+        kinds = {kind.replace("_", " "): colour for kind, colour in KIND_COLOURS.items()}
+        heading = " and ".join(shown)
+        parts.append(f"<b>{heading[0].upper()}{heading[1:]}</b>{_keys(kinds)}")
+    disagreements = {
+        names.get(name, name.replace("_", " ")): colour
+        for name, colour in DISCREPANCY_COLOURS.items()
+        if len(getattr(page.discrepancy, name))
+    }
+    if disagreements:
+        parts.append(f"<b>{names.get('disagreement', LAYERS['disagreement'])}</b>{_keys(disagreements)}")
+    return f'<div class="legend">{"".join(parts)}</div>'
+
+
+def _keys(colours: dict[str, str]) -> str:
+    items = "".join(f'<span><i style="background:{colour}"></i>{name}</span>' for name, colour in colours.items())
+    return f"<div>{items}</div>"
 
 
 def _text(value: str) -> str:
