@@ -31,7 +31,7 @@ def make_kinds_table(metrics: MapMetrics, title: str) -> RenderableType:
     ):
         lines.append((heading, *(_format_number(value, 3 if heading.startswith("F1") else 2) for value in values), ""))
     lines.append(("predicted/true elements", *(f"{k.n_predicted}/{k.n_truth}" for k in kinds), ""))
-    return make_table(title, ("metric", *(k.kind for k in kinds), "crossing and divider"), lines)
+    return make_table(title, ("metric", *(k.kind for k in kinds), "mean of crossing and divider"), lines)
 
 
 def make_change_table(changes: Sequence[KindChange], title: str) -> RenderableType:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +55,18 @@ def test_an_array_of_numpy_has_three_or_four_columns(tmp_path: Path) -> None:
     assert bright.intensity.tolist() == pytest.approx([0.1, 0.2, 0.3]) and plain.intensity.tolist() == [0, 0, 0]
     with pytest.raises(RecordingError, match=r"found float32 \(3, 2\)"):
         read_cloud(tmp_path / "2.npy")
+
+
+@pytest.mark.parametrize("rows", [10**4, 10**15, 10**30])
+def test_an_array_whose_header_states_more_points_than_the_file_has_is_named(tmp_path: Path, rows: int) -> None:
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f4", "fortran_order": False, "shape": (rows, 4)})
+    (tmp_path / "0.npy").write_bytes(header.getvalue() + bytes(64))
+    with zipfile.ZipFile(tmp_path / "0.npz", "w") as archive:
+        archive.writestr("points.npy", header.getvalue() + bytes(64))
+    for name in ("0.npy", "0.npz"):
+        with pytest.raises(RecordingError, match=rf"{name}: expected an a\w+ of numpy"):
+            read_cloud(tmp_path / name)
 
 
 def test_a_pcd_file_is_read_by_its_suffix(tmp_path: Path) -> None:

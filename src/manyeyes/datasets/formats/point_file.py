@@ -68,8 +68,8 @@ def read_npz(path: Path, drop_nan: bool = False) -> PcdCloud:
 def read_npy(path: Path, drop_nan: bool = False) -> PcdCloud:
     """Read one array of points: (N, 3), metres, or (N, 4) with their intensities."""
     try:
-        points = np.load(io.BytesIO(_read(path, "an array of numpy")), allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+        points = _parse_array(_read(path, "an array of numpy"))
+    except (OSError, ValueError) as error:
         raise RecordingError(
             f"{path}: expected an array of numpy, found something else ({error}); {_REMEDY}."
         ) from None
@@ -124,4 +124,12 @@ def _read(path: Path, expected: str) -> bytes:
 
 
 def _load(archive: zipfile.ZipFile, name: str, path: Path) -> np.ndarray:
-    return np.load(io.BytesIO(unpack_zip_member(archive, name, MAX_FILE_BYTES, path)), allow_pickle=False)
+    return _parse_array(unpack_zip_member(archive, name, MAX_FILE_BYTES, path))
+
+
+def _parse_array(data: bytes) -> np.ndarray:
+    """Parse an array of numpy; ValueError where it is none, or its header states more than the memory holds."""
+    try:
+        return np.load(io.BytesIO(data), allow_pickle=False)
+    except (EOFError, OverflowError, MemoryError) as error:
+        raise ValueError(str(error)) from None
