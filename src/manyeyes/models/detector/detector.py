@@ -96,11 +96,16 @@ class Detector(nn.Module):
         self.head = BoxHead(channels, config.head_channels, config.classes)
         self.is_bare = bool(getattr(self.fusion, "is_bare", False))
         self.refine = None if self.is_bare else RefineHead(channels, config.head_channels, config.classes)
-        if self.is_bare and config.codebook is not None:
-            raise ConfigError(
-                f"fusion {config.fusion} sends features without proposals: it has no codebook; use float16."
-            )
+        if config.codebook is not None:
+            self.check_has_proposals()
         self.codebook = None if config.codebook is None else Codebook(channels, config.codebook)
+
+    def check_has_proposals(self) -> None:
+        """Raise ConfigError where the fusion sends features without proposals, which have no codebook."""
+        if self.is_bare:
+            raise ConfigError(
+                f"fusion {self.config.fusion} sends features without proposals: it has no codebook; use float16."
+            )
 
     @property
     def device(self) -> torch.device:

@@ -130,10 +130,7 @@ def fit_codebook(
     Raises:
         ConfigError: the fusion sends features without proposals and so has no codebook, or no agent shares a token.
     """
-    if detector.is_bare:
-        raise ConfigError(
-            f"Fusion {detector.config.fusion} sends features without proposals: it has no codebook; use float16."
-        )
+    detector.check_has_proposals()
     rows: list[Tensor] = []
     frames = _select_frames(recording, frame_stride)
     report(CollectionProgress(0, len(frames), 0))
