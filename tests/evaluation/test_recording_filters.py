@@ -6,7 +6,8 @@ import torch
 
 from manyeyes.datatypes import AgentFrame, Boxes, ConfigError, GroundTruth, PointCloud, Snapshot, Transform
 from manyeyes.evaluation.detection.average_precision import PROTOCOLS, select_ego_truth
-from manyeyes.evaluation.detection.recording_filters import FrameStride, NearestAgents
+from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
+from manyeyes.evaluation.detection.recording_filters import FrameStride, NearestAgents, ScenarioStride
 
 #      ego 7      12 m away      40 m away     5 m away
 PLACES = {7: (0.0, 0.0), 3: (12.0, 0.0), 9: (40.0, 0.0), 4: (0.0, 5.0)}
@@ -45,9 +46,19 @@ def test_every_kth_frame_is_evaluated_and_none_after_the_last(every, left) -> No
     assert list(evaluated) == left and evaluated.stop == left[-1] + 1
 
 
-def test_every_zeroth_is_refused() -> None:
+@pytest.mark.parametrize("view", [FrameStride, ScenarioStride])
+def test_every_zeroth_is_refused(view) -> None:
     with pytest.raises(ConfigError, match="at least 1; got 0"):
-        FrameStride(Street(), 0)
+        view(Street(), 0)
+
+
+@pytest.mark.parametrize(("every", "left"), [(1, ("few", "many")), (2, ("few",)), (9, ("few",))])
+def test_every_kth_scenario_is_evaluated(every, left) -> None:
+    assert BenchmarkConfig(scenario_stride=every).filter_recording(Street()).scenarios == left
+
+
+def test_scenarios_are_chosen_before_those_of_too_few_agents_are_left_out() -> None:
+    assert BenchmarkConfig(scenario_stride=2, num_agents=3).filter_recording(Street()).scenarios == ()
 
 
 @pytest.mark.parametrize(("count", "left"), [(1, [7]), (2, [7, 4]), (3, [7, 3, 4]), (4, [7, 3, 9, 4])])

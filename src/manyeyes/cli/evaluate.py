@@ -79,6 +79,7 @@ def _evaluate(options: Options) -> None:
         pose_noise=noise,
         odometry_drift=None if noise is None else errors.make_odometry_drift(options.seed),
         frame_stride=options.frame_stride,
+        scenario_stride=options.scenario_stride,
     )
     protocol, detector = resolve_protocol(config), load_detector(config.weights)
     check_class(options.object_class, protocol.classes)
@@ -89,14 +90,15 @@ def _evaluate(options: Options) -> None:
     config = replace(config, replay=adapt_to_dataset(config.replay, options.replay_options, recording))
     missing = check_files(recording, options.checks, console)
     print_sensor_note(recording, recording.scenarios[0], detector, console)
-    with track(console, "Evaluating", len(recording.scenarios)) as report:
+    num_scenarios = len(config.filter_recording(recording).scenarios)
+    with track(console, "Evaluating", num_scenarios) as report:
         results = run_benchmark(opener, config, options.workers, report, thresholds)
     results = [r for r in results if options.object_class in (None, r.class_name)]
     timed_results = _add_times(results, recording, detector, config.replay, options.timing_frames)
     seed = read_training_seed(options.replay_options.weights)
     comparison = summarize_comparison(timed_results, protocol, missing, seed)
     data_name = f"{options.data.name}{f'/{options.split}' if options.split else ''}"
-    title = f"{display_name(options.replay_options.weights)} on {data_name}: {len(recording.scenarios)} scenarios, {protocol.name}"
+    title = f"{display_name(options.replay_options.weights)} on {data_name}: {num_scenarios} scenarios, {protocol.name}"
     note = "" if noise is None else errors.describe(options.seed)
     print_comparison(console, comparison, title)
     if note:

@@ -45,6 +45,8 @@ class RecordingStudyOptions(StudyOptions):
     """Which split of a data set, such as test: a folder inside it; with DAIR-V2X one of its split file."""
     frame_stride: PositiveInt = 1
     """Evaluate every n-th of the frames that the recording evaluates."""
+    scenario_stride: PositiveInt = 1
+    """Only every n-th scenario."""
     seed: Seed = 0
     """Of losses, jitter and pose errors."""
     checks: FileChecks = field(default_factory=FileChecks)
@@ -153,8 +155,6 @@ class AttacksOptions(EvaluationOptions):
     """Numbers of malicious agents of the first attack; all others have their own."""
     egos: PositiveInt = 1
     """How many agents of a scenario are the ego in turn, with malicious agents around it."""
-    scenario_stride: PositiveInt = 1
-    """Only every n-th scenario."""
     position_sigma_m: LengthM = 0.4
     """Standard deviation of the prior positions of senders, metres."""
     heading_sigma_deg: AngleDeg = 0.4

@@ -25,7 +25,7 @@ from manyeyes.datatypes import VEHICLES, ConfigError, Snapshot
 from manyeyes.evaluation.detection.accumulator import IOU_THRESHOLDS, MethodResult, MetricAccumulator
 from manyeyes.evaluation.detection.answer_time import answer_of
 from manyeyes.evaluation.detection.protocols import DetectionProtocol, get_protocol
-from manyeyes.evaluation.detection.recording_filters import CachedRecording, FrameStride, NearestAgents
+from manyeyes.evaluation.detection.recording_filters import CachedRecording, FrameStride, NearestAgents, ScenarioStride
 from manyeyes.evaluation.detection.sensor_change import NO_SENSOR_CHANGE, SensorChange
 from manyeyes.evaluation.statistics.operating_point import OperatingThreshold
 from manyeyes.models import pretrained
@@ -41,8 +41,9 @@ CONDITIONS_PER_GROUP = 8
 class BenchmarkConfig:
     """What is compared, and how it is evaluated. weights: a name, a path or a detector. protocol: by name, over its range.
 
-    frame_stride: judge each so many-th frame. num_agents: the nearest so many, in scenarios that have them; None: all of all
-    scenarios. sensors: changes of all agents' sensors. odometry_drift: of all agents, the ego too; None: odometry is true.
+    frame_stride, scenario_stride: judge each so many-th frame, of each so many-th scenario. num_agents: the nearest so many, in
+    scenarios that have them; None: all of all scenarios. sensors: changes of all agents' sensors. odometry_drift: of all agents,
+    the ego too; None: odometry is true.
     """
 
     weights: str | BoxDetector = pretrained.DEFAULT_DETECTOR
@@ -52,12 +53,14 @@ class BenchmarkConfig:
     pose_noise: PoseNoise | None = None
     odometry_drift: OdometryDrift | None = None
     frame_stride: int = 1
+    scenario_stride: int = 1
     num_agents: int | None = None
     sensors: SensorChange = NO_SENSOR_CHANGE
 
     def filter_recording(self, recording: Recording) -> Recording:
         """What is evaluated of a recording."""
-        filtered = recording if self.num_agents is None else NearestAgents(recording, self.num_agents)
+        filtered = recording if self.scenario_stride == 1 else ScenarioStride(recording, self.scenario_stride)
+        filtered = filtered if self.num_agents is None else NearestAgents(filtered, self.num_agents)
         return filtered if self.frame_stride == 1 else FrameStride(filtered, self.frame_stride)
 
     def make_perturbation(self) -> Callable[[Snapshot], Snapshot]:

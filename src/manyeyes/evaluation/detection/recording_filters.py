@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Views of a recording: some of its evaluated frames, some of its agents, or cached snapshots. All are recordings."""
+"""Views of a recording: some of its scenarios, evaluated frames or agents, or cached snapshots. All are recordings."""
 
 from __future__ import annotations
 
@@ -36,6 +36,39 @@ class FrameStride:
         """Return the indices K apart; the range ends behind the last of them, so that no further frame is replayed."""
         indices = self.recording.eval_indices(scenario)[:: self.stride]
         return range(indices.start, indices[-1] + 1, indices.step) if indices else indices
+
+    def agents(self, scenario: str) -> tuple[int, ...]:
+        """As in the recording."""
+        return self.recording.agents(scenario)
+
+    def snapshot(self, scenario: str, index: int) -> Snapshot:
+        """As in the recording."""
+        return self.recording.snapshot(scenario, index)
+
+
+@dataclass(frozen=True)
+class ScenarioStride:
+    """Every K-th scenario of a recording, the first one always."""
+
+    recording: Recording
+    stride: int
+
+    def __post_init__(self) -> None:
+        if self.stride < 1:
+            raise ConfigError(f"Every K-th scenario is evaluated, K at least 1; got {self.stride}.")
+
+    @property
+    def scenarios(self) -> tuple[str, ...]:
+        """Those K apart, in the recording's order."""
+        return self.recording.scenarios[:: self.stride]
+
+    def length(self, scenario: str) -> int:
+        """As in the recording."""
+        return self.recording.length(scenario)
+
+    def eval_indices(self, scenario: str) -> range:
+        """As in the recording."""
+        return self.recording.eval_indices(scenario)
 
     def agents(self, scenario: str) -> tuple[int, ...]:
         """As in the recording."""

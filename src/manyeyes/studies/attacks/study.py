@@ -48,7 +48,7 @@ def run(options: AttacksOptions, context: StudyContext) -> None:
     study = _prepare(options, context)
     pairs = list_pairs(options.attacks or tuple(ATTACKS), study.base.methods, options.defences, options.counts)
     recording = study.base.filter_recording(study.opener())
-    scenarios = recording.scenarios[:: options.scenario_stride]
+    scenarios = recording.scenarios
     digest = hash_recording(recording)
     jobs = [
         AttackScenarioJob(study.opener, study.base, name, pairs, options.egos, study.context.store, digest)
@@ -62,7 +62,7 @@ def run(options: AttacksOptions, context: StudyContext) -> None:
     rows = tuple(make_row(results, pair) for pair in pairs if results.num_scenarios(pair))
     if not rows:
         raise ConfigError("No scenario has an ego with an honest majority around it; take scenarios of more agents.")
-    title = f"{study.title}; {len(scenarios)} of {len(recording.scenarios)} scenarios, {options.egos} ego(s) each"
+    title = f"{study.title}; {options.egos} ego(s) each"
     notes = (
         NOTE,
         f"Prior poses err by {options.position_sigma_m:g} m and {options.heading_sigma_deg:g} degrees. "

@@ -88,7 +88,8 @@ def open_study(options: RecordingStudyOptions, context: StudyContext, config: Be
     opener = partial(open_recording, options.data, options.split)
     missing = check_files(opener(), options.checks, context.console)
     context = replace(context, missing=missing, seed=options.seed)
-    return ReplayStudy(context, opener, replace(config, frame_stride=options.frame_stride))
+    strides = {"frame_stride": options.frame_stride, "scenario_stride": options.scenario_stride}
+    return ReplayStudy(context, opener, replace(config, **strides))
 
 
 def prepare_study(options: EvaluationOptions, context: StudyContext, all_egos: bool = False) -> ReplayStudy:

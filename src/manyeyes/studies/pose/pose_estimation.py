@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -75,7 +76,7 @@ def run_trials(study: ReplayStudy, trials: Sequence[CorrectorTrial]) -> tuple[li
     """Return the rows of every trial, and the risk among null pairs of every corrector; stored results are not computed again."""
     pairs_by_net: dict[str, list[LandmarkPair]] = {}
     stride, detector = study.base.frame_stride, load_detector(study.base.weights)
-    recording = study.opener()
+    recording = replace(study.base, frame_stride=1).filter_recording(study.opener())
     data_key = hash_recording(recording), detector.fingerprint.hex(), stride
     nets = {name: PoseCorrection(name).net for name in dict.fromkeys(trial.corrector for trial in trials)}
     net_fingerprints = {name: "" if net is None else fingerprint(net).hex() for name, net in nets.items()}
