@@ -19,6 +19,7 @@ from torch import nn
 from manyeyes.models.detector.box_head import BOX_LAYOUT
 from manyeyes.models.detector.proposal import proposed_heat, proposed_offset
 from manyeyes.models.detector.transformer import AttentionConfig
+from manyeyes.models.fusion import _shift_kernels
 from manyeyes.models.fusion.registry import get_fusion, register_fusion
 from manyeyes.models.fusion.token_merge import DRIFT_MPS, MAX_OFFSET_CELLS
 from manyeyes.models.fusion.transform_tokens import Tokens
@@ -98,85 +99,21 @@ class SenderShift:
 
 def estimate_shift(ego: Peaks, sender: Peaks, origin: F64, config: ShiftConfig = DEFAULT_SHIFT) -> SenderShift | None:
     """Return the correction of a sender at origin (2,) in the ego's frame; None where the peaks do not give one."""
-    away = ego.center[None] - sender.center[:, None]
-    weight = np.sqrt(ego.weight[None] * sender.weight[:, None])
-    near = (away**2).sum(2) <= config.max_shift_m**2
-    if near.any(1).sum() < config.min_pairs:
+    settings = np.array(list(vars(config).values()), dtype=np.float64)
+    partner = np.empty(len(sender.center), np.int64)
+    num_pairs = _shift_kernels.find_pairs(ego.center, ego.weight, sender.center, sender.weight, settings, partner)
+    if num_pairs < config.min_pairs:
         return None
-    best = _find_mode(away, weight, near, config)
-    if best is None:
-        return None
-    rows, columns = _match(away, best, near, config)
-    if len(rows) < config.min_pairs:
-        return None
-    arm = sender.center[rows] - origin
-    design = np.zeros((len(rows), 2, 3))
-    design[:, 0, 0] = design[:, 1, 1] = 1
-    design[:, 0, 2], design[:, 1, 2] = -arm[:, 1], arm[:, 0]
-    measured = away[rows, columns]
+    rows = (partner >= 0).nonzero()[0]
+    columns = partner[rows]
     variance = config.object_sigma_m**2 + sender.sigma[rows] ** 2 + ego.sigma[columns] ** 2
-    solved = _solve(design, measured, weight[rows, columns] / variance, config)
-    if solved is None:
+    precision = np.sqrt(ego.weight[columns] * sender.weight[rows]) / variance
+    measured, arm = ego.center[columns] - sender.center[rows], sender.center[rows] - origin
+    estimate, covariance = np.empty(3), np.empty((3, 3))
+    chi2 = _shift_kernels.solve_pairs(arm, measured, precision, settings, estimate, covariance)
+    if not (chi2 >= config.min_chi2 and np.isfinite(estimate).all()):
         return None
-    estimate, covariance = solved
-    return SenderShift(estimate[:2], float(estimate[2]), origin, covariance, len(rows))
-
-
-def _find_mode(away: F64, weight: F64, near: NDArray[np.bool_], config: ShiftConfig) -> F64 | None:
-    """Return the displacement (2,) of most votes; None where another one, apart from it, has almost as many.
-
-    Each peak of the sender votes once for a displacement: by the nearest of its pairs.
-    """
-    candidates = np.concatenate((np.zeros((1, 2)), away[near]))
-    votes = _count_votes(candidates, away, weight, near, config)
-    best = int(votes.argmax())
-    apart = ((candidates - candidates[best]) ** 2).sum(1) > (2 * config.match_m) ** 2
-    if apart.any() and votes[apart].max() > config.max_second * votes[best]:
-        return None
-    # The mean of the pairs that vote for the mode.
-    mode = candidates[best]
-    for _ in range(3):
-        share = np.where(near, weight * np.exp(-((away - mode) ** 2).sum(2) / (2 * config.vote_m**2)), 0.0)
-        mode = (share[:, :, None] * away).sum((0, 1)) / max(share.sum(), 1e-9)
-    return mode
-
-
-def _count_votes(candidates: F64, away: F64, weight: F64, near: NDArray[np.bool_], config: ShiftConfig) -> F64:
-    """Return the votes (k,) for displacements (k, 2); a large displacement is less likely by the prior."""
-    votes = np.zeros(len(candidates))
-    for line, of_pair, is_near in zip(away, weight, near):
-        some, scale = line[is_near], of_pair[is_near]
-        if len(some):
-            square = ((candidates[:, None] - some[None]) ** 2).sum(2)
-            votes += (scale * np.exp(-square / (2 * config.vote_m**2))).max(1)
-    return votes * np.exp(-(candidates**2).sum(1) / (2 * (2 * config.prior_sigma_m) ** 2))
-
-
-def _match(
-    away: F64, mode: F64, near: NDArray[np.bool_], config: ShiftConfig
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return pairs of sender and ego peaks that are the nearest of each other at a displacement."""
-    square = np.where(near, ((away - mode) ** 2).sum(2), np.inf)
-    of_sender, of_ego = square.argmin(1), square.argmin(0)
-    rows = np.arange(len(square))
-    good = (of_ego[of_sender] == rows) & (square[rows, of_sender] <= config.match_m**2)
-    return rows[good], of_sender[good]
-
-
-def _solve(design: F64, measured: F64, precision: F64, config: ShiftConfig) -> tuple[F64, F64] | None:
-    """Return the estimate (3,) and its covariance (3, 3) by least squares with Cauchy weights; None where it is not significant."""
-    prior = np.diag([config.prior_sigma_m**-2.0, config.prior_sigma_m**-2.0, config.prior_sigma_yaw_rad**-2.0])
-    robust, estimate, inverse = np.ones(len(measured)), np.zeros(3), np.linalg.inv(prior)
-    for _ in range(4):
-        scale = precision * robust
-        normal = np.einsum("nij,n,nik->jk", design, scale, design) + prior
-        inverse = np.linalg.inv(normal)
-        estimate = inverse @ np.einsum("nij,n,ni->j", design, scale, measured)
-        error = ((measured - design @ estimate) ** 2).sum(1)
-        robust = 1 / (1 + precision * error / 4)
-    # Against no error at all: the part of the evidence that the estimate explains.
-    chi2 = float(estimate @ (np.linalg.inv(inverse) - prior) @ estimate)
-    return (estimate, inverse) if chi2 >= config.min_chi2 and np.isfinite(estimate).all() else None
+    return SenderShift(estimate[:2], float(estimate[2]), origin, covariance, num_pairs)
 
 
 def find_peaks(xy: F64, heat: F64, sigma: F64, config: ShiftConfig = DEFAULT_SHIFT) -> Peaks:
@@ -184,12 +121,8 @@ def find_peaks(xy: F64, heat: F64, sigma: F64, config: ShiftConfig = DEFAULT_SHI
     score = 1 / (1 + np.exp(-np.clip(heat, -30, 30)))
     order = np.argsort(-score, kind="stable")
     order = order[(score[order] >= config.min_score) & np.isfinite(xy[order]).all(1)][: 8 * config.max_peaks]
-    kept = list[int]()
-    for i in order.tolist():
-        if len(kept) == config.max_peaks:
-            break
-        if not kept or ((xy[kept] - xy[i]) ** 2).sum(1).min() > config.peak_radius_m**2:
-            kept.append(i)
+    row = np.empty(config.max_peaks, np.int64)
+    kept = row[: _shift_kernels.pick_peaks(xy, order, config.peak_radius_m, row)]
     return Peaks(xy[kept], score[kept], np.clip(sigma[kept], 0.0, 2.0))
 
 

@@ -57,6 +57,7 @@ def _mix_sensors(config: DetectorTrainConfig) -> DetectorTrainConfig:
 
 _BRANCH = replace(
     _FINAL,
+    detector=replace(_FINAL.detector, fusion="fast"),
     degradation=replace(_FINAL.degradation, sender_history=2),
     steps=240,
     learning_rate=3e-4,
