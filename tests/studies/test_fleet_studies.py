@@ -16,10 +16,11 @@ from manyeyes.datatypes import ConfigError
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, MapElements
 from manyeyes.evaluation.maps import adversarial
 from manyeyes.evaluation.maps.adversarial import make_attacks, measure_displacement
+from manyeyes.evaluation.maps.association_oracle import fuse_with_true_association
 from manyeyes.evaluation.maps.experiment import FleetTrial, replace_poses, run_trial
 from manyeyes.evaluation.maps.malicious_agents import AgentErrors
 from manyeyes.evaluation.maps.metrics import THRESHOLDS, KindAp, KindMetrics, LengthScore, MapMetrics, evaluate_map
-from manyeyes.evaluation.maps.oracles import fuse_with_true_association, split_in_half
+from manyeyes.evaluation.maps.oracles import split_in_half
 from manyeyes.evaluation.maps.registry import (
     TUNED_CHANGES,
     MethodSettings,
@@ -41,6 +42,7 @@ from manyeyes.studies.maps.adversarial import AdversarialJob
 from manyeyes.studies.maps.fleet_cells import FleetJob, FleetResult, make_cell
 from manyeyes.studies.maps.fusion import (
     compare_with_best,
+    compare_with_oracle,
     compute_paired_difference,
     find_best_baseline,
     make_trials,
@@ -97,6 +99,14 @@ def test_the_best_baseline_is_that_of_the_requested_metric() -> None:
     assert compute_paired_difference(sixty, OURS, "union", "mean_ap", "exact", "narrow").value == pytest.approx(
         (0.5 + 0.3) / 2
     )
+
+
+def test_lateral_errors_are_divided_by_those_of_the_joint_oracle() -> None:
+    """Twice the median and a quarter of the p95 in one cell; the other cell has no oracle."""
+    kinds = tuple(replace(k, lateral_median_m=0.05, lateral_p95_m=0.8) for k in RESULTS[0].metrics.kinds)
+    oracle = replace(RESULTS[0], method="oracle-joint", metrics=MapMetrics(kinds))
+    ratios = {c.metric: c.interval.value for c in compare_with_oracle("60 observations", [*select(60), oracle])}
+    assert ratios == pytest.approx({"lateral median": 0.1 / 0.05, "lateral p95": 0.2 / 0.8})
 
 
 def test_ours_is_compared_with_the_best_baseline_of_each_metric() -> None:

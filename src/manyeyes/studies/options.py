@@ -263,7 +263,7 @@ class MapFusionStudyOptions(FleetStudyOptions):
     methods: tuple[str, ...] = ()
     """Map fusion methods; by default all."""
     oracles: bool = False
-    """Add the oracle rows: truth cut again, true poses, known association."""
+    """Add the oracle rows: truth cut again, true poses, known association at prior and at jointly estimated poses."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -42,7 +42,7 @@ TITLES = {
 HEADINGS = (
     "method", "AP crossing", "AP divider", "mAP Chamfer-exact [95 % CI]", "mAP MapTR",
     "mAP StreamMapNet (1.0/1.5/2.0 m)", "F1@0.5 m divider", "duplication", "fragmentation",
-    "lateral error [m]", "endpoint error [m]", "time [s]",
+    "lateral error [m]", "lateral p95 [m]", "endpoint error [m]", "time [s]",
 )  # fmt: skip
 
 
@@ -66,6 +66,8 @@ def run(options: MapFusionStudyOptions, context: StudyContext) -> None:
         if context.name == "fusion" and OURS in methods
         else []
     )
+    if OURS in methods and options.oracles:
+        comparisons += [c for group, part in groups.items() for c in compare_with_oracle(group, part)]
     tables = [_make_table(group, [s for s in summaries if s.group == group]) for group in groups]
     tables += [make_comparison_table(comparisons, "results")] if comparisons else []
     payload: dict[str, object] = {"summaries": summaries, "comparisons": comparisons, "results": results}
@@ -122,6 +124,7 @@ class MethodSummary:
     duplication: float
     fragmentation: float
     lateral_error_m: float
+    lateral_p95_m: float
     endpoint_error_m: float
     seconds: float
 
@@ -142,6 +145,7 @@ def _summarize(group: str, method: str, results: Sequence[FleetResult]) -> Metho
         duplication=_mean([d.duplication for d in dividers]),
         fragmentation=_mean([d.fragmentation for d in dividers]),
         lateral_error_m=_mean([d.lateral_median_m for d in dividers]),
+        lateral_p95_m=_mean([d.lateral_p95_m for d in dividers]),
         endpoint_error_m=_mean([d.endpoint_error_m for d in dividers]),
         seconds=_mean([r.seconds for r in own]),
     )
@@ -166,6 +170,31 @@ def compare_with_best(group: str, results: Sequence[FleetResult], methods: Seque
     measure("F1@0.5 m divider", lambda r: r.metrics.get_length_score("divider").f1)
     measure("duplication divider", lambda r: r.metrics.get_kind("divider").duplication)
     return out
+
+
+def compare_with_oracle(group: str, results: Sequence[FleetResult]) -> list[Comparison]:
+    """Return our lateral errors over those of the oracle with joint poses and true associations, mean of ratios over cells."""
+    ours, limit = (
+        {
+            (r.place, r.size_m, r.view_label, r.num_observations, r.seed): r.metrics.get_kind("divider")
+            for r in results
+            if r.method == m
+        }
+        for m in (OURS, "oracle-joint")
+    )
+    keys = sorted(ours.keys() & limit.keys())
+    pairs = {
+        "lateral median": [(ours[k].lateral_median_m, limit[k].lateral_median_m) for k in keys],
+        "lateral p95": [(ours[k].lateral_p95_m, limit[k].lateral_p95_m) for k in keys],
+    }
+    return [
+        Comparison(
+            f"{group}: {OURS} / oracle-joint",
+            name,
+            mean_interval([a / b for a, b in values if b > 0 and not math.isnan(a)]),
+        )
+        for name, values in pairs.items()
+    ]
 
 
 def find_best_baseline(
@@ -204,7 +233,9 @@ def _make_table(group: str, summaries: Sequence[MethodSummary]) -> StudyTable:
             *(format_number(value, 3) for value in (s.crossing, s.divider)),
             format_interval(s.mean_ap),
             *(format_number(value, 3) for value in (s.maptr, s.streammapnet, s.f1)),
-            *(format_number(v, 2) for v in (s.duplication, s.fragmentation, s.lateral_error_m, s.endpoint_error_m)),
+            *(format_number(v, 2) for v in (s.duplication, s.fragmentation)),
+            *(format_number(v, 3) for v in (s.lateral_error_m, s.lateral_p95_m)),
+            format_number(s.endpoint_error_m, 2),
             format_number(s.seconds, 1),
         )
         for s in summaries
