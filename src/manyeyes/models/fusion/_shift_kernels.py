@@ -37,22 +37,20 @@ def pick_peaks(xy: F64x2, order: I64x1, radius_m: float, row: I64x1) -> int:  # 
 
 
 @njit(cache=True, nogil=True)
-def find_pairs(  # pragma: no cover
-    ego_xy: F64x2, ego_weight: F64x1, xy: F64x2, weight: F64x1, settings: F64x1, partner: I64x1
-) -> int:
-    """Fill partner (n,) with the ego's peak of each of the sender's, -1 for none; returns the number of pairs, 0 without a mode.
+def find_mode(  # pragma: no cover
+    ego_xy: F64x2, ego_weight: F64x1, xy: F64x2, weight: F64x1, settings: F64x1, mode: F64x1
+) -> bool:
+    """Fill mode (2,) with the displacement from a sender's peaks to the ego's that has the best vote; returns whether there is one.
 
-    Each peak of the sender votes once for a displacement: by the nearest of its pairs. There is no mode with too few pairs, or
-    where another displacement, apart from it, has almost as many votes. Pairs are the nearest of each other at the mode.
-    ego_xy, xy: (m, 2) and (n, 2), metres.
+    Each peak of the sender votes once for a displacement: by the nearest of its pairs. There is no mode with too few voters, or
+    where another displacement, apart from it, has almost as many votes. ego_xy, xy: (m, 2) and (n, 2), metres.
     """
-    max_shift_m, min_pairs, vote_m, match_m = settings[3], settings[4], settings[5], settings[6]
-    max_second, prior_sigma_m = settings[7], settings[9]
+    max_shift_m, vote_m, prior_sigma_m = settings[3], settings[5], settings[9]
     capacity = xy.shape[0] * ego_xy.shape[0] + 1
     away, strength = np.zeros((capacity, 2)), np.zeros(capacity)
     begin = np.empty(xy.shape[0] + 1, np.int64)
     # Entry 0 is no displacement; the pairs of sender peak i are begin[i] to begin[i + 1].
-    count, votes_of = 1, 0
+    count, voters = 1, 0
     for i in range(xy.shape[0]):
         begin[i] = count
         for j in range(ego_xy.shape[0]):
@@ -61,29 +59,26 @@ def find_pairs(  # pragma: no cover
                 away[count, 0], away[count, 1] = dx, dy
                 strength[count] = math.sqrt(ego_weight[j] * weight[i])
                 count += 1
-        if count > begin[i]:
-            votes_of += 1
+        voters += count > begin[i]
     begin[xy.shape[0]] = count
-    for i in range(xy.shape[0]):
-        partner[i] = -1
-    if votes_of < min_pairs:
-        return 0
+    if voters < settings[4]:
+        return False
     votes, best = np.zeros(count), 0
     for c in range(count):
         x, y = away[c, 0], away[c, 1]
         for i in range(xy.shape[0]):
-            most = 0.0
+            vote = 0.0
             for k in range(begin[i], begin[i + 1]):
                 dx, dy = x - away[k, 0], y - away[k, 1]
-                most = max(most, strength[k] * math.exp(-(dx * dx + dy * dy) / (2 * vote_m * vote_m)))
-            votes[c] += most
+                vote = max(vote, strength[k] * math.exp(-(dx * dx + dy * dy) / (2 * vote_m * vote_m)))
+            votes[c] += vote
         votes[c] *= math.exp(-(x * x + y * y) / (8 * prior_sigma_m * prior_sigma_m))
         if votes[c] > votes[best]:
             best = c
     for c in range(count):
         dx, dy = away[c, 0] - away[best, 0], away[c, 1] - away[best, 1]
-        if dx * dx + dy * dy > 4 * match_m * match_m and votes[c] > max_second * votes[best]:
-            return 0
+        if dx * dx + dy * dy > 4 * settings[6] * settings[6] and votes[c] > settings[7] * votes[best]:
+            return False
     # The mean of the pairs that vote for the mode.
     x, y = away[best, 0], away[best, 1]
     for _ in range(3):
@@ -95,17 +90,29 @@ def find_pairs(  # pragma: no cover
             sum_x += share * away[k, 0]
             sum_y += share * away[k, 1]
         x, y = sum_x / max(total, 1e-9), sum_y / max(total, 1e-9)
-    nearest, least = np.full(ego_xy.shape[0], -1), np.full(ego_xy.shape[0], np.inf)
+    mode[0], mode[1] = x, y
+    return True
+
+
+@njit(cache=True, nogil=True)
+def match_peaks(ego_xy: F64x2, xy: F64x2, mode: F64x1, settings: F64x1, partner: I64x1) -> int:  # pragma: no cover
+    """Fill partner (n,) with the ego's peak of each of the sender's, -1 for none; returns the number of pairs.
+
+    Pairs are the nearest of each other at the displacement mode (2,). ego_xy, xy: (m, 2) and (n, 2), metres.
+    """
+    max_shift_m, match_m = settings[3], settings[6]
+    nearest, shortest = np.full(ego_xy.shape[0], -1), np.full(ego_xy.shape[0], np.inf)
     square = np.full(xy.shape[0], np.inf)
     for i in range(xy.shape[0]):
+        partner[i] = -1
         for j in range(ego_xy.shape[0]):
             dx, dy = ego_xy[j, 0] - xy[i, 0], ego_xy[j, 1] - xy[i, 1]
             if dx * dx + dy * dy <= max_shift_m * max_shift_m:
-                distance = (dx - x) * (dx - x) + (dy - y) * (dy - y)
+                distance = (dx - mode[0]) * (dx - mode[0]) + (dy - mode[1]) * (dy - mode[1])
                 if distance < square[i]:
                     square[i], partner[i] = distance, j
-                if distance < least[j]:
-                    least[j], nearest[j] = distance, i
+                if distance < shortest[j]:
+                    shortest[j], nearest[j] = distance, i
     pairs = 0
     for i in range(xy.shape[0]):
         if partner[i] >= 0 and (nearest[partner[i]] != i or square[i] > match_m * match_m):

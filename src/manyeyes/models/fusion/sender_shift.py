@@ -100,8 +100,10 @@ class SenderShift:
 def estimate_shift(ego: Peaks, sender: Peaks, origin: F64, config: ShiftConfig = DEFAULT_SHIFT) -> SenderShift | None:
     """Return the correction of a sender at origin (2,) in the ego's frame; None where the peaks do not give one."""
     settings = np.array(list(vars(config).values()), dtype=np.float64)
-    partner = np.empty(len(sender.center), np.int64)
-    num_pairs = _shift_kernels.find_pairs(ego.center, ego.weight, sender.center, sender.weight, settings, partner)
+    partner, mode = np.empty(len(sender.center), np.int64), np.empty(2)
+    if not _shift_kernels.find_mode(ego.center, ego.weight, sender.center, sender.weight, settings, mode):
+        return None
+    num_pairs = _shift_kernels.match_peaks(ego.center, sender.center, mode, settings, partner)
     if num_pairs < config.min_pairs:
         return None
     rows = (partner >= 0).nonzero()[0]
