@@ -81,6 +81,32 @@ def test_the_same_settings_keep_a_finished_folder(folder: Path) -> None:
     assert json.loads((folder / "simulate.json").read_text())["result"]["scenarios"] == 2
 
 
+def test_splits_are_added_one_by_one_and_are_those_of_a_whole_run(tmp_path: Path, monkeypatch, capsys) -> None:
+    two = (SplitPreset("train", ("generated-1",), 1), SplitPreset("test", ("generated-2",), 1))
+    monkeypatch.setitem(SIMULATION_PRESETS, "two", replace(SMALL, splits=two))
+    assert simulate(tmp_path / "parts", "--splits", "test", preset="two") == 0
+    manifest = json.loads((tmp_path / "parts" / "manifest.json").read_text())
+    assert {entry["split"] for entry in manifest["scenarios"]} == {"test"}
+    assert not (tmp_path / "parts" / "train").exists()
+    assert simulate(tmp_path / "parts", "--splits", "train", preset="two") == 0
+    assert simulate(tmp_path / "whole", preset="two") == 0
+    assert hashes(tmp_path / "parts") == hashes(tmp_path / "whole")
+    assert "no split 'tset'; choose from train, test" in refused_split(tmp_path / "parts", capsys, "tset", "two")
+    monkeypatch.setitem(SIMULATION_PRESETS, "numbered", replace(SMALL, layout="dair", vehicles=(1, 1)))
+    assert "numbers the frames of all splits together" in refused_split(tmp_path / "dair", capsys, "test", "numbered")
+    assert not (tmp_path / "dair").exists()
+
+
+def refused_split(out: Path, capsys: pytest.CaptureFixture[str], split: str, preset: str) -> str:
+    """The one line of the error; nothing was changed."""
+    before = hashes(out) if out.is_dir() else {}
+    capsys.readouterr()
+    assert simulate(out, "--splits", split, preset=preset) == 1
+    assert (hashes(out) if out.is_dir() else {}) == before
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
+
+
 def test_another_seed_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = refused(folder, capsys, "--seed", 1)
     assert "2 finished scenarios of preset 'small', seed 0" in line and "preset 'small', seed 1" in line

@@ -18,6 +18,8 @@ class Options:
     """Which set of scenarios; an unknown name lists the known ones."""
     out: OutputFolder | None = None
     """Folder for the splits and the manifest, data/PRESET or data/PRESET-cameras; a run that was stopped goes on there."""
+    splits: tuple[str, ...] = ()
+    """Only these splits, such as test; by default all. A later run with others adds them to the folder."""
     seed: Seed = 0
     """Another seed, other scenes."""
     workers: WorkerCount = os.cpu_count() or 1
@@ -37,27 +39,28 @@ def main(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes.datasets.missing import FileProblem
-    from manyeyes.simulator.presets import simulate, simulation_preset
+    from manyeyes.simulator.presets import RecordedContent, simulate, simulation_preset
     from manyeyes.simulator.record import RecordingProgress
     from manyeyes.studies import provenance
     from manyeyes.viz.progress import make_progress_bars
 
     preset = simulation_preset(options.preset)
     out = options.out or Path("data") / f"{options.preset}{'-cameras' if options.cameras else ''}"
-    total = sum(part.count for part in preset.splits)
+    total = sum(part.count for part in preset.splits if not options.splits or part.split in options.splits)
     console = Console()
     with make_progress_bars(console) as progress:
         task = progress.add_task("Simulating", total=total)
 
         def report(at: RecordingProgress) -> None:
-            progress.update(task, completed=at.done)
+            progress.update(task, completed=at.done, total=at.total)
 
         def report_repair(problem: FileProblem) -> None:
             console.print(f"simulated again: {problem}", highlight=False, markup=False, soft_wrap=True)
 
         on_repair = report_repair if options.repair else None
+        content = RecordedContent(options.splits, options.cameras)
         manifest = simulate(
-            options.preset, out, options.seed, options.workers, report, options.towns, options.cameras, on_repair
+            options.preset, out, options.seed, options.workers, report, options.towns, content, on_repair
         )
     held = json.loads(manifest.read_text(encoding="utf-8"))["scenarios"]
     provenance.write_json(

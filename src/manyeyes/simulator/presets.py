@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -331,6 +331,30 @@ def make_jobs(preset: SimulationPreset, seed: int, towns: str | None = None) -> 
     return sorted(jobs, key=lambda job: (job.split != "train", job.split != "validate", job.spec.town, job.spec.name))
 
 
+@dataclass(frozen=True)
+class RecordedContent:
+    """What of a preset is recorded. splits: by name, beside what the folder holds already; none: all. cameras: pictures too."""
+
+    splits: tuple[str, ...] = ()
+    cameras: bool = False
+
+
+EVERYTHING = RecordedContent()
+"""All splits, without pictures."""
+
+
+def _find_split_folders(name: str, preset: SimulationPreset, splits: Sequence[str]) -> frozenset[str]:
+    """Return the folders of splits of a preset."""
+    known = [part.split for part in preset.splits]
+    if unknown := [split for split in splits if split not in known]:
+        raise ConfigError(f"The preset '{name}' has no split '{unknown[0]}'; choose from {', '.join(known)}.")
+    if preset.layout != "opv2v":
+        raise ConfigError(
+            f"The preset '{name}' is in DAIR-V2X's layout, which numbers the frames of all splits together; simulate all splits."
+        )
+    return frozenset(SPLIT_FOLDERS.get(split, split) for split in splits)
+
+
 def simulate(
     preset: str,
     out: Path | str,
@@ -338,15 +362,21 @@ def simulate(
     workers: int = 1,
     progress: Callable[[RecordingProgress], None] | None = None,
     towns: Path | str | None = None,
-    cameras: bool = False,
+    content: RecordedContent = EVERYTHING,
     on_repair: Callable[[FileProblem], None] | None = None,
 ) -> Path:
     """Simulate a preset's recording into a folder; returns the path of its manifest.
 
     towns: the first place to search for roads. on_repair: as in :func:`~manyeyes.simulator.record.record`.
+
+    Raises:
+        ConfigError: the preset or a split is unknown, or the layout is DAIR-V2X's, which numbers the frames of all splits together.
     """
     place = None if towns is None else str(towns)
-    wanted = with_cameras(simulation_preset(preset)) if cameras else simulation_preset(preset)
+    wanted = with_cameras(simulation_preset(preset)) if content.cameras else simulation_preset(preset)
     jobs = make_jobs(wanted, seed, place)
+    if content.splits:
+        folders = _find_split_folders(preset, wanted, content.splits)
+        jobs = [job for job in jobs if job.split in folders or (Path(out) / job.split / job.spec.name).is_dir()]
     write = record_dair if wanted.layout == "dair" else record
     return write(jobs, out, workers, progress, {"preset": preset, "seed": seed}, on_repair)

@@ -32,12 +32,11 @@ INSIDE_FUSIONS = (
     "sparsealign",
     "how2comm",
     "ermvp",
-    "instances",
     "self-attention",
     "multi-scale",
     "shift/fast",
 )
-"""Fusions in mode inside; our own arms are instances, the merge by distance, and shift/fast, FAST on aligned senders."""
+"""Fusions in mode inside; our own arm is shift/fast, FAST on aligned senders."""
 BARE_FUSIONS = ("max", "attfuse", "v2vnet", "v2x-vit", "where2comm", "disconet", "sparsealign", "how2comm", "ermvp")
 """Fusions in mode bare: features alone are sent."""
 DISTILLATION = 10.0
