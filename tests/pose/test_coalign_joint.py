@@ -55,6 +55,12 @@ def test_agents_without_a_common_object_are_tied_through_a_third() -> None:
     assert alone.status is PoseStatus.NO_MATCH
 
 
+def test_agents_that_share_objects_with_each_other_alone_have_no_estimate() -> None:
+    """The ego sees nothing of what both others see."""
+    seen = [layout(slice(0)), seen_from(POSES[0], layout()), seen_from(POSES[1], layout())]
+    assert [found.status for found in correct_jointly(seen, [prior(p) for p in POSES])] == [PoseStatus.NO_MATCH] * 2
+
+
 def test_one_pair_of_agents_gives_what_the_corrector_of_pairs_gives() -> None:
     g = np.random.default_rng(0)
     ego, other = layout(), seen_from(POSES[0], layout())

@@ -56,6 +56,8 @@ def correct_jointly(
     if len(clusters) <= config.min_objects or 2 * sum(hard) >= len(clusters):
         return [no_estimate(prior) for prior in priors]
     connected = _connect_to_ego([c for c, is_hard in zip(clusters, hard) if not is_hard])
+    if not connected:
+        return [no_estimate(prior) for prior in priors]
     poses, covariances = _optimize(_Graph(agents, start, connected))
     tied = {agent for cluster in connected for agent, _ in cluster}
     return [
