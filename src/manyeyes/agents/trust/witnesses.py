@@ -85,9 +85,7 @@ def count_witnesses(
     return counts
 
 
-def _states_free(
-    frame: AgentFrame, message: Message, boxes: PlacedBoxes, config: WitnessConfig
-) -> NDArray[np.bool_]:
+def _states_free(frame: AgentFrame, message: Message, boxes: PlacedBoxes, config: WitnessConfig) -> NDArray[np.bool_]:
     """Return (N,) which boxes the sight of a message states to be free."""
     if message.sight is None or not len(boxes.columns):
         return np.zeros(len(boxes.columns), np.bool_)
@@ -104,9 +102,7 @@ def _states_free(
     x, y, yaw = (max(float(covariance[k, k]), 0.0) for k in range(3))
     variance = (x + y) / 2 + (SIGMA_VELOCITY_MPS * seconds) ** 2 + yaw * np.square(columns[:, :2]).sum(1)
     margin_m = config.margin_m + config.num_sigmas * np.sqrt(boxes.sigma_m**2 + variance)
-    is_tested = (margin_m <= config.max_margin_m) & (
-        np.abs(columns[:, 2] - columns[:, 5] / 2) <= config.max_height_m
-    )
+    is_tested = (margin_m <= config.max_margin_m) & (np.abs(columns[:, 2] - columns[:, 5] / 2) <= config.max_height_m)
     is_free = np.zeros(len(columns), np.bool_)
     is_free[is_tested] = find_free(message.sight, columns[is_tested], margin_m[is_tested])
     return is_free

@@ -67,7 +67,9 @@ def measure_steps(
 
 
 @njit(cache=True, nogil=True)
-def find_free_boxes(steps: U8x1, boxes: F64x2, margin_m: F64x1, step_m: float, min_m: float) -> Boolx1:  # pragma: no cover
+def find_free_boxes(
+    steps: U8x1, boxes: F64x2, margin_m: F64x1, step_m: float, min_m: float
+) -> Boolx1:  # pragma: no cover
     """Return (K,) whether the enlarged footprint of each box (K, 7: centre, size, yaw) lies within the free ranges."""
     num_sectors, free = len(steps), np.zeros(len(boxes), np.bool_)
     farthest, corner = np.empty(num_sectors), np.empty((4, 2))
