@@ -99,10 +99,11 @@ and y of the first and the difference of each further one to the one before it, 
 327.66 m. No point equals the one before it.
 
 A sight (kind 6) is one packet of 180 bytes, in the sender's frame: byte k is the free range of the azimuths from 2 k to 2 k + 2
-degrees, counterclockwise from x, 0.5 m (``datatypes.sight``). From 5 m on to that range rays at the height of vehicles passed; 0
-states nothing. Kind 6 came after version 4: a reader that does not know it refuses the packet as garbage and uses the other sections.
+degrees, counterclockwise from x, 0.5 m (``datatypes.sight``). From 5 m to that range rays at the height of vehicles passed; 0
+states nothing. Kind 6 came after version 4: a reader that does not know it refuses the packet as garbage and uses the other
+sections.
 
-Packets are numbered objects first, then the request, then the sight, then tokens by falling score (ties by key), then map elements, then points:
+Packets are numbered objects first, then the request, the sight, tokens by falling score (ties by key), map elements, and points:
 a message that is cut after any packet still helps. A message without sections is one packet of kind 0. Empty sections are one
 packet with no rows. There is no length: what was cut or padded fails the checksum.
 """

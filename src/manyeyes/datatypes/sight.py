@@ -21,8 +21,8 @@ MIN_FREE_M = 5.0
 class Sight:
     """Free ranges of an agent about the origin of its frame, where rays at the height of vehicles passed.
 
-    steps: (NUM_SECTORS,) uint8, in STEP_M: sector k has the azimuths from 2 k to 2 k + 2 degrees, counterclockwise from x. Between
-    MIN_FREE_M and its free range a sector holds no vehicle at the time of the sweep; 0 states nothing, and nothing is stated beyond.
+    steps: (NUM_SECTORS,) uint8, in STEP_M: sector k has the azimuths from 2 k to 2 k + 2 degrees, counterclockwise from x. From
+    MIN_FREE_M to its free range a sector holds no vehicle at the time of the sweep. Nothing is stated beyond; 0 states nothing.
     """
 
     steps: NDArray[np.uint8]
@@ -35,4 +35,4 @@ class Sight:
     @property
     def free_m(self) -> NDArray[np.float64]:
         """Free range (NUM_SECTORS,) of each sector, metres."""
-        return self.steps * STEP_M
+        return self.steps.astype(np.float64) * STEP_M

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Witnesses: trusted senders whose sight states free space where another sender claims an object that the ego cannot see.
 
-Source of the idea: free space that agents share, in Zhang et al. (CAD, USENIX Security 2024), and the perception regions of ETSI TS 103
-324. A sight can be false, so one witness has no effect. Witnesses that copy each other, or state one place, are one.
+Source of the idea: free space that agents share, in Zhang et al. (CAD, USENIX Security 2024), and the perception regions of
+ETSI TS 103 324. A sight can be false, so one witness has no effect. Witnesses that copy each other, or state one place, are one.
 """
 
 from __future__ import annotations

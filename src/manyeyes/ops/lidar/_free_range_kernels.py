@@ -21,8 +21,8 @@ def _azimuth(x: float, y: float) -> float:  # pragma: no cover
 def measure_steps(
     points: F32x2, height_m: float, num_sectors: int, num_parts: int, limits: F64x1
 ) -> U8x1:  # pragma: no cover
-    """Return the free range of each sector in steps. limits: step, first range, bottom and top of the band that a ray passes through,
-    top of what stops it, distance to a return that is not free; metres.
+    """Return the free range of each sector in steps. limits: step, first range, bottom and top of the band that a ray passes
+    through, top of what stops it, distance to a return that is not free; metres.
     """
     step, first_m, bottom, top, max_obstacle, behind = limits
     num_columns, num_bins = num_sectors * num_parts, 255

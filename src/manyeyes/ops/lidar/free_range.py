@@ -35,9 +35,9 @@ def measure_sight(points: Tensor, sensor_height_m: float) -> Sight:
 
 
 def find_free(sight: Sight, boxes: F64x2, margin_m: F64x1) -> NDArray[np.bool_]:
-    """Return (K,) which boxes (K, 7: centre, size, yaw) a sight states to be free: the whole footprint, enlarged by the margin (K,).
+    """Return (K,) which boxes a sight states to be free: the whole footprint, enlarged by the margin (K,), metres.
 
-    The boxes are in the frame of the sight. A footprint nearer than MIN_FREE_M is never free.
+    boxes: (K, 7) centre, size and yaw, in the frame of the sight. A footprint nearer than MIN_FREE_M is never free.
     """
     return find_free_boxes(sight.steps, np.ascontiguousarray(boxes), np.ascontiguousarray(margin_m), STEP_M, MIN_FREE_M)
 
