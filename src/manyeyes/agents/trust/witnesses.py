@@ -28,7 +28,8 @@ class WitnessConfig:
     """When the sights of others refute a claim.
 
     min_witnesses: trusted, independent, and neither the claimer nor accused. margin_m, num_sigmas: the footprint of the claim is
-    enlarged by margin_m and so many standard deviations of claim and witness, to max_margin_m; beyond it nothing is concluded.
+    enlarged by margin_m and so many standard deviations of claim and witness together, of min_sigma_m or more, to max_margin_m;
+    beyond it nothing is concluded.
     max_height_m: of the ground of the claim above or below that of the witness. min_apart_m: of witnesses that count as two.
     min_own_score: of a detection of the ego; a sight that states it to be free is not used.
     """
@@ -36,6 +37,7 @@ class WitnessConfig:
     min_witnesses: int = 2
     margin_m: float = 0.3
     num_sigmas: float = 2.0
+    min_sigma_m: float = 0.3
     max_margin_m: float = 2.5
     max_height_m: float = 0.5
     min_apart_m: float = 2.0
@@ -101,7 +103,8 @@ def _states_free(frame: AgentFrame, message: Message, boxes: PlacedBoxes, config
     covariance = frame.pose_covariance.numpy() + message.pose_covariance.numpy()
     x, y, yaw = (max(float(covariance[k, k]), 0.0) for k in range(3))
     variance = (x + y) / 2 + (SIGMA_VELOCITY_MPS * seconds) ** 2 + yaw * np.square(columns[:, :2]).sum(1)
-    margin_m = config.margin_m + config.num_sigmas * np.sqrt(boxes.sigma_m**2 + variance)
+    sigma_m = np.maximum(np.sqrt(boxes.sigma_m**2 + variance), config.min_sigma_m)
+    margin_m = config.margin_m + config.num_sigmas * sigma_m
     is_tested = (margin_m <= config.max_margin_m) & (np.abs(columns[:, 2] - columns[:, 5] / 2) <= config.max_height_m)
     is_free = np.zeros(len(columns), np.bool_)
     is_free[is_tested] = find_free(message.sight, columns[is_tested], margin_m[is_tested])
