@@ -35,6 +35,7 @@ from manyeyes.datatypes import (
 )
 from manyeyes.datatypes.keypoints import Keypoints
 from manyeyes.datatypes.message import DESCRIPTOR_DIM, LocalMap, RequestMap
+from manyeyes.datatypes.sight import NUM_SECTORS, Sight
 
 GRID = BevGrid(-12.8, -6.4, -3.0, 12.8, 6.4, 1.0, 0.4, 4)
 SEEDS = st.integers(0, 2**32 - 1)
@@ -102,6 +103,7 @@ def make_message(
         None if objects is None else torch.nn.functional.normalize(torch.ones(len(objects), DESCRIPTOR_DIM)),
         RequestMap(GRID, torch.from_numpy(draw.integers(0, 256, GRID.shape) / 255).float()),
         LocalMap(make_elements(seed, 2), view),
+        sight=None if seed % 3 else Sight(draw.integers(0, 256, NUM_SECTORS)),
     )
 
 
@@ -149,6 +151,9 @@ st.register_type_strategy(
     ),
 )
 st.register_type_strategy(RequestMap, st.from_type(Message).map(lambda message: message.request))
+st.register_type_strategy(
+    Sight, st.builds(lambda seed: Sight(np.random.default_rng(seed).integers(0, 256, NUM_SECTORS)), SEEDS)
+)
 st.register_type_strategy(LocalMap, st.from_type(Message).map(lambda message: message.local_map))
 st.register_type_strategy(
     AgentFrame,

@@ -55,7 +55,9 @@ def specimens(detector: Detector, frame: AgentFrame) -> list[bytes]:
     """Packets of all kinds of bodies and all encodings, from one sender."""
     found: list[bytes] = []
     for encoding in ("float32", "float16", "int8"):
-        found += Agent(detector, token_encoding=encoding, budget_bytes=6000, send_request_map=True).share(frame)
+        found += Agent(
+            detector, token_encoding=encoding, budget_bytes=6000, send_request_map=True, send_sight=True
+        ).share(frame)
     found += Agent(detector, get_strategy("late")).share(frame)
     found += Agent(detector, get_strategy("early")).share(frame)[:2]
     lines = [np.array([[2.0, -3.0], [9.0, -2.5], [20.0, 1.0]]), np.array([[5.0, 5.0], [8.0, 5.0], [8.0, 8.0]])]

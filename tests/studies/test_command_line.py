@@ -20,7 +20,7 @@ CHANGED = MainTableOptions(
     split="val",
     frame_stride=2,
     checks=FileChecks(allow_missing=True),
-    replay_options=ReplayOptions(methods=("late", "early"), budget_bytes=1398, request_maps=True),
+    replay_options=ReplayOptions(methods=("late", "early"), budget_bytes=1398, request_maps=True, sight=True),
     pose_errors=PoseErrorOptions(noise_in_time="constant", odometry_drift=False),
     channels=("ideal",),
     perturbations=("clean", "30 % loss"),

@@ -56,6 +56,7 @@ from manyeyes.comms.wire import TokenEncoding
 from manyeyes.datatypes import AgentFrame, Boxes, Message, SparseBev
 from manyeyes.models.detector.protocols import BoxDetector, check_detector, require_tokens
 from manyeyes.models.score_calibration import calibrate_boxes
+from manyeyes.ops.lidar.free_range import measure_sight
 
 if TYPE_CHECKING:
     from manyeyes.agents.map_perception import MapPredictor
@@ -104,6 +105,7 @@ class Agent:
     Agents exchange nothing but the packets of share; frames carry no labels, so ground truth cannot leak by type.
     token_encoding: of the tokens; None: the default of these weights (``agents.token_codec``).
     send_request_map: messages with tokens carry a request map, one byte a window (``comms.request_map``).
+    send_sight: messages carry the free space about the agent's LiDAR, 248 bytes (``datatypes.sight``).
     pose_correction: corrects prior poses of senders before fusion; None uses the prior poses. map_predictor: predicts the local map
     that the agent sends (``agents.map_perception``); None sends no map. token_format: of the tokens that the agent can fuse.
     misbehaviour: assesses senders before fusion (``agents.trust``); None fuses all with weight 1.
@@ -120,6 +122,7 @@ class Agent:
         send_request_map: bool = False,
         map_predictor: MapPredictor | None = None,
         misbehaviour: MisbehaviourDetector | None = None,
+        send_sight: bool = False,
     ) -> None:
         check_detector(detector)
         self.perception_cache, self.message_history = perception_cache or PerceptionCache(detector), MessageHistory()
@@ -137,6 +140,7 @@ class Agent:
         self.token_encoding: TokenEncoding = token_encoding or default_token_encoding(detector)
         self.budget_bytes = budget_bytes
         self.send_request_map, self.map_predictor = send_request_map, map_predictor
+        self.send_sight = send_sight
         self.token_format = make_token_format(detector)
         if token_encoding == "codebook":
             require_codebook(detector)
@@ -192,7 +196,7 @@ class Agent:
         return 0 if form is None or self.token_encoding != "clusters" else form[1]
 
     def _compose(self, frame: AgentFrame, requests: Sequence[Message]) -> Message | None:
-        """Return the message of the strategy, with the local map, descriptors and request map that the agent adds."""
+        """Return the message of the strategy, with the local map, descriptors, request map and sight that the agent adds."""
         message = self.strategy.compose_message(self.perception_cache, frame, requests)
         local_map = None if self.map_predictor is None else self.map_predictor(frame, requests)
         if local_map is not None:
@@ -204,6 +208,8 @@ class Agent:
         sends_request_map = self.send_request_map or getattr(self.strategy, "needs_request_map", False)
         if message is not None and message.tokens is not None and sends_request_map and message.request is None:
             message = replace(message, request=make_request_map(self.perception_cache, frame))
+        if message is not None and self.send_sight:
+            message = replace(message, sight=measure_sight(frame.points.xyz, frame.sensor_height_m))
         return message
 
     def _select(

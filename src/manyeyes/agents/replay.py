@@ -18,7 +18,7 @@ from manyeyes.comms.bandwidth import allocate_max_min_fair
 from manyeyes.comms.channel import ChannelPreset, channel_preset
 from manyeyes.comms.inbox import Inbox
 from manyeyes.comms.message_contents import MessageContents, count_contents
-from manyeyes.comms.wire import TokenEncoding
+from manyeyes.comms.wire import SIGHT_PACKET_BYTES, TokenEncoding
 from manyeyes.datasets.base import Recording, RecordingReader
 from manyeyes.datatypes import AgentFrame, Boxes, Snapshot, Transform
 from manyeyes.models.detector.protocols import BoxDetector
@@ -41,6 +41,7 @@ class ReplayConfig:
     histories. comm_range_m: maximum distance of sender and receiver (true poses). channel_budget_bytes: bytes of all agents at one
     instant, allocated by ``comms.bandwidth.allocate_max_min_fair`` from what each agent would send without a limit, as by a central
     scheduler. send_request_map: messages with tokens carry a request map, and received request maps weight the token scores.
+    send_sight: messages carry the free space of their senders (``datatypes.sight``), by which trusted ones refute claims of others.
     pose_correction: of received messages; None uses their prior poses. misbehaviour: of all agents; None trusts every sender.
     limits_contents: budget_bytes limits boxes and points too (``agents.content_budget``), not tokens alone.
     """
@@ -55,6 +56,7 @@ class ReplayConfig:
     comm_range_m: float = 70.0
     seed: int = 0
     send_request_map: bool = False
+    send_sight: bool = False
     pose_correction: PoseCorrection | None = None
     misbehaviour: MisbehaviourDetector | None = None
     limits_contents: bool = False
@@ -196,12 +198,15 @@ class DetectionReplay:
                 config.pose_correction,
                 config.send_request_map,
                 misbehaviour=config.misbehaviour,
+                send_sight=config.send_sight,
             )
         return self._agents[agent_id]
 
     def _make_strategy(self) -> FusionStrategy:
         strategy, budget = get_strategy(self.method), self.config.budget_bytes
-        return strategy if budget is None or not self.config.limits_contents else BudgetedStrategy(strategy, budget)
+        if budget is None or not self.config.limits_contents:
+            return strategy
+        return BudgetedStrategy(strategy, budget - self.config.send_sight * SIGHT_PACKET_BYTES)
 
     def _make_inbox(self, agent_id: int) -> Inbox:
         return self._agent(agent_id).inbox(EXPIRE_NS)

@@ -25,6 +25,7 @@ from manyeyes.comms.token_format import TokenFormat
 from manyeyes.comms.wire import Envelope, Fragment, open_packet, read_fragment
 from manyeyes.datatypes import BevGrid
 from manyeyes.datatypes.message import RequestMap
+from manyeyes.datatypes.sight import Sight
 
 ContentCheck = Callable[[Fragment], DropReason | None]
 """Why a packet is refused by its content; None accepts it."""
@@ -61,6 +62,7 @@ class Admission:
             ObjectRows: (self._check_objects,),
             ElementRows: (self._check_elements,),
             RequestMap: (self._check_grid,),
+            Sight: (self._check_sight,),
         }
 
     def open(self, packet: bytes, arrival_ns: int | None, origin: Origin = UNKNOWN_ORIGIN) -> Envelope | DropReason:
@@ -137,6 +139,11 @@ class Admission:
         max_units = self._limits.max_range_m / UNIT_M
         far = any(int(np.abs(line).max()) > max_units for line in fragment.body.lines)
         return "range" if far else None
+
+    def _check_sight(self, fragment: Fragment) -> DropReason | None:
+        if not isinstance(fragment.body, Sight):
+            return None
+        return None if float(fragment.body.free_m.max()) <= self._limits.max_range_m else "range"
 
 
 def _max_edge_m(grid: BevGrid) -> float:

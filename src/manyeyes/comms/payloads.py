@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The bodies of packets: tokens, objects, points, requests to bytes and back, as :mod:`manyeyes.comms.wire` lays down.
+"""The bodies of packets: tokens, objects, points, requests, sights to bytes and back, as :mod:`manyeyes.comms.wire` lays down.
 
 Those of map elements stand in :mod:`manyeyes.comms.map_payload`.
 """
@@ -33,13 +33,14 @@ from manyeyes.comms.map_payload import ElementRows, read_elements
 from manyeyes.comms.primitives import PacketError
 from manyeyes.datatypes import LABELS, BevGrid, Boxes, ConfigError, PointCloud, Sites, SparseBev, WireError
 from manyeyes.datatypes.message import DESCRIPTOR_DIM, RequestMap
+from manyeyes.datatypes.sight import NUM_SECTORS, Sight
 
 TokenEncoding = Literal["float32", "float16", "int8", "codebook", "clusters"]
 
 TOKEN_ENCODINGS: tuple[TokenEncoding, ...] = ("float32", "float16", "int8", "codebook", "clusters")
 # The middle of what drives in European cities.
 LABEL_HEIGHTS = (1.6, 2.3, 3.2, 3.2, 1.7, 1.7, 1.6)
-NONE, TOKENS, OBJECTS, POINTS, REQUEST, ELEMENTS = range(6)
+NONE, TOKENS, OBJECTS, POINTS, REQUEST, ELEMENTS, SIGHT = range(7)
 
 _GRID = struct.Struct("<6hHB")
 _TOKENS = struct.Struct("<BHH")
@@ -105,7 +106,7 @@ class PointRows:
     rows: NDArray[Any]
 
 
-Body = TokenRows | ObjectRows | PointRows | RequestMap | ElementRows | None
+Body = TokenRows | ObjectRows | PointRows | RequestMap | ElementRows | Sight | None
 
 
 def _centimetres(metres: NDArray[np.floating[Any]], what: str) -> NDArray[np.int16]:
@@ -391,6 +392,13 @@ def pack_request_body(request: RequestMap, capacity: int) -> bytes:
     return _GRID.pack(*_grid_fields(request.grid)) + np.rint(confidence.numpy() * 255).astype(np.uint8).tobytes()
 
 
+def pack_sight_body(sight: Sight, capacity: int) -> bytes:
+    """Return the body of the one packet of a sight: one byte a sector."""
+    if capacity < NUM_SECTORS:
+        raise WireError(f"A sight fits one packet, {NUM_SECTORS} bytes; a body has {capacity}: raise the mtu.")
+    return sight.steps.tobytes()
+
+
 def _values(features: Tensor, encoding: TokenEncoding, counts: list[int]) -> tuple[bytes, list[bytes]]:
     """Return features (N, C) as the bytes of their rows, and the bytes of each body's scales; counts: the rows of each body."""
     if encoding == "int8":
@@ -421,6 +429,8 @@ def read_body(
         return read_elements(body)
     if kind == POINTS:
         return PointRows(_rows(body, _POINT))
+    if kind == SIGHT:
+        return _read_sight(body)
     if kind != NONE or body:
         raise PacketError("garbage", f"A body of kind {kind} and {len(body)} bytes is not known.")
     return None
@@ -480,6 +490,12 @@ def _read_request(body: bytes) -> RequestMap:
         raise PacketError("garbage", f"A request of {cells} cells does not fill a body of {len(body)} bytes.")
     confidence = np.frombuffer(body, np.uint8, offset=_GRID.size).astype(np.float32) / 255
     return RequestMap(grid, torch.from_numpy(confidence).view(grid.shape))
+
+
+def _read_sight(body: bytes) -> Sight:
+    if len(body) != NUM_SECTORS:
+        raise PacketError("garbage", f"A sight has {NUM_SECTORS} bytes, one a sector; got {len(body)}.")
+    return Sight(np.frombuffer(body, np.uint8))
 
 
 def _read_tokens(body: bytes, fingerprint: bytes, tables: CodeTables | None) -> TokenRows:

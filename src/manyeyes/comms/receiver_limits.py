@@ -40,7 +40,7 @@ class ReceiverLimits:
     max_objects: int = 256
     max_points: int = 200_000
     max_map_elements: int = 512
-    # Distance of objects, map elements and the edges of a grid from their sender
+    # Distance of objects, map elements, free ranges and the edges of a grid from their sender
     max_range_m: float = 300.0
     # Fused: tokens of one message, beyond which all of them are excluded; senders, and tokens of all of them, at one instant
     max_fused_message_tokens: int = 2_048

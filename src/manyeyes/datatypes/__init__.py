@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     )
     from manyeyes.datatypes.message import Message as Message
     from manyeyes.datatypes.point_cloud import PointCloud as PointCloud
+    from manyeyes.datatypes.sight import Sight as Sight
     from manyeyes.datatypes.snapshot import AgentFrame as AgentFrame, GroundTruth as GroundTruth, Snapshot as Snapshot
     from manyeyes.datatypes.sparse_bev import Sites as Sites, SparseBev as SparseBev
     from manyeyes.datatypes.transform import Transform as Transform

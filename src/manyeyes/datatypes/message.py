@@ -15,6 +15,7 @@ from manyeyes.datatypes.errors import ShapeError
 from manyeyes.datatypes.grid import BevGrid
 from manyeyes.datatypes.map_element import MapElements, Polygons, freeze
 from manyeyes.datatypes.point_cloud import PointCloud
+from manyeyes.datatypes.sight import Sight
 from manyeyes.datatypes.sparse_bev import SparseBev
 from manyeyes.datatypes.transform import Transform
 
@@ -59,14 +60,14 @@ class LocalMap:
 
 @dataclass(frozen=True)
 class Message:
-    """Header and up to five sections; a section that is not sent is None.
+    """Header and up to six sections; a section that is not sent is None.
 
     world_from_agent: the prior pose at timestamp_ns, the time of capture; pose_covariance: (3, 3), x, y, yaw.
     fingerprint: 8 bytes that name the weights which made the tokens; tokens of other weights are refused.
     tokens: one grid, in the sender's frame; features float, or uint8 rows of the weights' codebook. token_score: (N,), which
     cells matter most. objects and points: sender's frame. descriptors: (objects, DESCRIPTOR) in [-1, 1], of each object, for
     matching. request: the sender's confidence. local_map: the map elements that it observes. body: of the sender's vehicle, in its
-    frame; None is unknown, and of infrastructure.
+    frame; None is unknown, and of infrastructure. sight: its free space at timestamp_ns, in its frame.
     """
 
     agent_id: int
@@ -83,3 +84,4 @@ class Message:
     request: RequestMap | None = None
     local_map: LocalMap | None = None
     body: AgentBody | None = None
+    sight: Sight | None = None

@@ -52,6 +52,7 @@ _RIGHTS: dict[int, Right] = {
     payloads.OBJECTS: "objects",
     payloads.POINTS: "points",
     payloads.ELEMENTS: "map",
+    payloads.SIGHT: "objects",
 }
 
 

@@ -63,6 +63,7 @@ class RunConfig:
     versions: dict[str, str | None]
     num_threads: int
     misbehaviour: str | None = None
+    send_sight: bool = False
     map_weights: str | None = None
     map_period_s: float = 1.0
     utc_offset_ns: int = 0

@@ -45,6 +45,9 @@ class ReplayOptions:
     (fusion ermvp); by default as clusters or codes where the weights have them, else as float16."""
     request_maps: bool = False
     """Send request maps with token messages, and weight tokens by the latest received ones (Where2comm)."""
+    sight: bool = False
+    """Send with each message how far the space around the sender's LiDAR is free, 248 bytes: with --misbehaviour ray-evidence, two
+    trusted senders refute what the ego cannot see."""
     pose_correction: str | None = None
     """Correct the poses of senders before fusion, by objects that both agents detect; leave out messages without a usable pose.
     Corrector: voting, learned-voting, feakm, a .safetensors file of FeaKM, or a baseline: identity, coalign, fpv-rcnn, feaco, icp,
@@ -80,6 +83,7 @@ class ReplayOptions:
             latency_budget_s=latency_budget_ms / 1e3,
             all_egos=all_egos,
             send_request_map=self.request_maps,
+            send_sight=self.sight,
             warmup_frames=WARMUP_FRAMES,
             seed=seed,
             pose_correction=None if self.pose_correction is None else PoseCorrection(self.pose_correction),

@@ -8,7 +8,7 @@ Perception: Attacks and Countermeasures" (CAD, USENIX Security 2024); here by si
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,12 +56,20 @@ class EvidenceConfig:
 class CheckedClaims:
     """Claims of one sender (N), with evidence: kinds (N,) of Evidence.
 
-    corroborated: (N,) bool, a trusted third agent claims it too, whatever the ego's evidence is.
+    corroborated: (N,) bool, a trusted third agent claims it too, whatever the ego's evidence is. is_minority: (N,) bool, refuted by
+    witnesses that are not the majority of senders: the claim is removed, and no trust changes.
     """
 
     claims: Claims
     kinds: Kinds
     corroborated: NDArray[np.bool_]
+    is_minority: NDArray[np.bool_]
+
+    def refute(self, is_denied: NDArray[np.bool_], is_minority: NDArray[np.bool_]) -> CheckedClaims:
+        """Return the claims where the denied ones (N,) that the ego itself cannot check are refuted."""
+        is_denied = is_denied & ((self.kinds == _UNCHECKED) | (self.kinds == _CORROBORATED))
+        kinds = np.where(is_denied, np.uint8(_REFUTED), self.kinds)
+        return replace(self, kinds=kinds, is_minority=is_denied & is_minority)
 
 
 def check_claims(
@@ -87,7 +95,10 @@ def check_claims(
     kinds = is_own * np.uint8(_SUPPORTED)
     rays = _check_rays(frame, columns, sigma_m, kinds, config, probes)
     kinds[is_third & (kinds == _UNCHECKED)] = _CORROBORATED
-    checked = (CheckedClaims(one, kinds[a:b], is_third[a:b]) for one, a, b in zip(claims, sizes, sizes[1:]))
+    checked = (
+        CheckedClaims(one, kinds[a:b], is_third[a:b], np.zeros(b - a, np.bool_))
+        for one, a, b in zip(claims, sizes, sizes[1:])
+    )
     return tuple(checked), rays
 
 

@@ -77,7 +77,7 @@ def keep_confirmed(frame: AgentFrame, message: Message, claims: AssessedClaims) 
     confirmed = torch.from_numpy(claims.claims.xy[claims.is_confirmed])
     is_denied = (claims.kinds == Evidence.REFUTED) | (claims.kinds == Evidence.DISPUTED)
     denied = torch.from_numpy(claims.claims.xy[is_denied])
-    bare = replace(message, points=None, local_map=None, request=None)
+    bare = replace(message, points=None, local_map=None, request=None, sight=None)
     kept = _keep(frame, bare, lambda xy: ~_is_far(xy, confirmed) & _is_far(xy, denied))
     num_kept = sum(len(part) for part in (kept.objects, None if kept.tokens is None else kept.tokens.sites) if part)
     return kept if num_kept else None

@@ -23,7 +23,7 @@ class Evidence(IntEnum):
 
     UNCHECKED: neither the ego nor a trusted third agent observes its place. SUPPORTED: the ego detects it, or has returns of it.
     CORROBORATED: a trusted third agent claims it too. DISPUTED: two agents, or two instants, contradict each other; it changes no
-    trust. REFUTED: the ego's rays pass through it. OWN: of a result, a detection of the ego itself.
+    trust. REFUTED: rays of the ego, or of several trusted agents, pass through it. OWN: of a result, a detection of the ego itself.
     """
 
     UNCHECKED = 0

@@ -146,6 +146,7 @@ def _make_command(options: Options, drive: Sequence[str], agent: int, number: in
     words += ["--record", str(options.out / f"agent-{agent}.mcap"), "--out", str(options.out / f"agent-{agent}.json")]
     words += ["--weights", method.weights, "--method", method.method, "--budget-bytes", str(method.budget_bytes)]
     words += ["--pose-correction", method.pose_correction] if method.pose_correction else []
+    words += ["--sight"] if method.sight else []
     words += ["--misbehaviour", method.misbehaviour] if method.misbehaviour else []
     map_weights = method.map_weights or (DEFAULT_MAP_WEIGHTS if options.map else None)
     words += ["--map-weights", map_weights, "--map-period-s", str(method.map_period_s)] if map_weights else []

@@ -86,6 +86,8 @@ class MethodOptions:
     """A strategy by name, one of your own too."""
     budget_bytes: ByteCount = 1 << 17
     """The most that a message of tokens may weigh, with its signatures."""
+    sight: bool = False
+    """Send how far the space around the LiDAR is free, 248 bytes a message, for the misbehaviour detectors of others."""
     pose_correction: str | None = None
     """Correct the poses of senders before fusion, by this corrector."""
     map_weights: str | None = None
@@ -113,6 +115,7 @@ class MethodOptions:
             versions=installed_versions(),
             num_threads=torch.get_num_threads(),
             misbehaviour=self.misbehaviour,
+            send_sight=self.sight,
             map_weights=None if self.map_weights is None else _absolute(self.map_weights),
             map_period_s=self.map_period_s,
             utc_offset_ns=-TAI_UTC_NS,
@@ -155,4 +158,5 @@ def make_agent(config: RunConfig) -> Agent:
         pose_correction=correction,
         map_predictor=map_predictor,
         misbehaviour=None if config.misbehaviour is None else get_misbehaviour_detector(config.misbehaviour),
+        send_sight=config.send_sight,
     )

@@ -174,6 +174,7 @@ class AttackedDrive:
                 config.send_request_map,
                 # Only the ego perceives, and only it defends itself.
                 misbehaviour=config.misbehaviour if agent_id == self.setting.roles.ego else None,
+                send_sight=config.send_sight,
             )
         return self._agents[agent_id]
 

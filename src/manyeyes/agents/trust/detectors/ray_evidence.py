@@ -41,6 +41,7 @@ from manyeyes.agents.trust.sender_state import (
     advance,
     forget_oldest,
 )
+from manyeyes.agents.trust.witnesses import PlacedBoxes, WitnessConfig, count_witnesses
 from manyeyes.datatypes import Boxes, Message
 
 LOW_TRUST = "low trust"
@@ -48,6 +49,7 @@ NUM_COPY_CHECKS = 5
 # Members of an enumeration are slow to read.
 _SUPPORTED, _CORROBORATED = int(Evidence.SUPPORTED), int(Evidence.CORROBORATED)
 _DISPUTED, _REFUTED = int(Evidence.DISPUTED), int(Evidence.REFUTED)
+_UNCHECKED = int(Evidence.UNCHECKED)
 
 
 @dataclass(frozen=True)
@@ -82,7 +84,7 @@ class NamingConfig:
 @register_misbehaviour_detector("ray-evidence")
 @dataclass(frozen=True)
 class RayEvidenceDetector(MisbehaviourDetector):
-    """Evidence, trust, omissions, common offsets, copies and naming, each with its constants."""
+    """Evidence, trust, omissions, common offsets, copies, witnesses and naming, each with its constants."""
 
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
     trust: TrustConfig = field(default_factory=TrustConfig)
@@ -90,6 +92,7 @@ class RayEvidenceDetector(MisbehaviourDetector):
     naming: NamingConfig = field(default_factory=NamingConfig)
     offset: OffsetConfig = field(default_factory=OffsetConfig)
     copies: CopyConfig = field(default_factory=CopyConfig)
+    witnesses: WitnessConfig = field(default_factory=WitnessConfig)
 
     def excluded(self, state: object | None, agent_ids: Collection[int], now_ns: int) -> frozenset[int]:
         """Return the senders whose term of exclusion has not ended."""
@@ -111,13 +114,15 @@ class RayEvidenceDetector(MisbehaviourDetector):
         ]
         now, found = self._compare_messages(received, own, now)
         checked, omits = self._check(received, own, now, unclaimed, found)
+        checked = self._check_witnesses(received, detections, checked, now, found)
         checks = [self._follow(one, now) for one in checked]
         now = replace(now, disputes=now.disputes.add(self._find_disputes(checked, checks, now), now.now_ns))
         if len(now.disputes.xy):
             checks = [_mark_disputed(check, now.disputes.cover(check.xy)) for check in checks]
+        counted = [_drop_minority(check, one.is_minority) for one, check in zip(checked, checks)]
         num_claims = sum(len(check.xy) for check in checks)
         senders, exclusions, assessments = dict(now.senders), now.exclusions, list[SenderAssessment]()
-        for message, check, omitted, is_omitting in zip(received.messages, checks, unclaimed, omits):
+        for message, check, omitted, is_omitting in zip(received.messages, counted, unclaimed, omits):
             agent_id = message.agent_id
             is_faulty = agent_id in received.faulty or agent_id in found.contradicted
             fault = self.trust.omitted * is_omitting
@@ -186,6 +191,42 @@ class RayEvidenceDetector(MisbehaviourDetector):
         )
         ends = np.cumsum([0, *map(len, probes)])
         return checked, [is_in_sight(rays[a:b], self.omissions) for a, b in pairwise(ends)]
+
+    def _check_witnesses(
+        self,
+        received: MisbehaviourInput,
+        detections: _Detections,
+        checked: tuple[CheckedClaims, ...],
+        now: TrustState,
+        found: _Findings,
+    ) -> tuple[CheckedClaims, ...]:
+        """Refute claims that the ego cannot check where trusted senders state free space; the ego's own evidence stays."""
+        if sum(message.sight is not None for message in received.messages) < self.witnesses.min_witnesses:
+            return checked
+        unused = self.excluded(now, received.agent_ids, now.now_ns) | found.unused | received.faulty
+        trusted = {
+            one.claims.agent_id
+            for one in checked
+            if one.claims.agent_id not in unused
+            and now.trust_of(one.claims.agent_id, self.trust).mean >= self.evidence.min_corroborating_trust
+            and not self._is_accused(one, now)
+        }
+        own = detections.boxes(self.witnesses.min_own_score)
+        copies = self.evidence.copy_m, self.evidence.max_copied
+        counts = count_witnesses(
+            received.frame, received.messages, received.claims, own, trusted, *copies, self.witnesses
+        )
+        num_senders = len(set(received.agent_ids) - unused)
+        return tuple(
+            one.refute(count >= self.witnesses.min_witnesses, 2 * count <= num_senders)
+            for one, count in zip(checked, counts)
+        )
+
+    def _is_accused(self, one: CheckedClaims, now: TrustState) -> bool:
+        """Return whether a claim of a sender is refuted now, or was in one of its last checks."""
+        is_refuted = (one.kinds == _REFUTED) & (one.claims.score >= self.naming.min_score)
+        tracks = _memory(now, one.claims.agent_id).tracks
+        return bool(is_refuted.any() or count_refuted_checks(tracks, self.naming.min_score).any())
 
     def _decide(
         self,
@@ -319,6 +360,11 @@ class _Detections:
         """Return the centres (M, 2) of those of a score."""
         return np.ascontiguousarray(self.columns[self.score >= min_score, :2])
 
+    def boxes(self, min_score: float) -> PlacedBoxes:
+        """Return those of a score, without errors of their own."""
+        kept = self.score >= min_score
+        return PlacedBoxes(self.columns[kept], self.velocity[kept], np.zeros(int(kept.sum())))
+
     def objects(self, min_score: float) -> OwnObjects:
         """Return those of a score as objects of one frame."""
         kept = self.score >= min_score
@@ -329,3 +375,9 @@ class _Detections:
 def _mark_disputed(checks: ClaimChecks, is_disputed: NDArray[np.bool_]) -> ClaimChecks:
     """Return checks whose claims at disputed places are disputed, on either side."""
     return replace(checks, evidence=np.where(is_disputed, np.uint8(_DISPUTED), checks.evidence))
+
+
+def _drop_minority(checks: ClaimChecks, is_minority: NDArray[np.bool_]) -> ClaimChecks:
+    """Return checks in which claims that a minority refutes are unchecked, as trust and naming count them."""
+    is_dropped = is_minority & (checks.evidence == _REFUTED)
+    return replace(checks, evidence=np.where(is_dropped, np.uint8(_UNCHECKED), checks.evidence))
