@@ -57,7 +57,7 @@ class CheckedClaims:
     """Claims of one sender (N), with evidence: kinds (N,) of Evidence.
 
     corroborated: (N,) bool, a trusted third agent claims it too, whatever the ego's evidence is. is_minority: (N,) bool, refuted by
-    witnesses that are not the majority of senders: the claim is removed, and no trust changes.
+    observers that are not the majority of senders: the claim is removed, and no trust changes.
     """
 
     claims: Claims

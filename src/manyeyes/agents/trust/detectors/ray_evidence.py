@@ -31,6 +31,7 @@ from manyeyes.agents.trust.interface import (
     SenderAssessment,
     SenderStatus,
 )
+from manyeyes.agents.trust.observers import ObserverConfig, PlacedBoxes, count_observers
 from manyeyes.agents.trust.omissions import OmissionConfig, OwnObjects, find_unclaimed, is_in_sight, make_probes
 from manyeyes.agents.trust.registry import register_misbehaviour_detector
 from manyeyes.agents.trust.sender_state import (
@@ -41,7 +42,6 @@ from manyeyes.agents.trust.sender_state import (
     advance,
     forget_oldest,
 )
-from manyeyes.agents.trust.witnesses import PlacedBoxes, WitnessConfig, count_witnesses
 from manyeyes.datatypes import Boxes, Message
 
 LOW_TRUST = "low trust"
@@ -84,7 +84,7 @@ class NamingConfig:
 @register_misbehaviour_detector("ray-evidence")
 @dataclass(frozen=True)
 class RayEvidenceDetector(MisbehaviourDetector):
-    """Evidence, trust, omissions, common offsets, copies, witnesses and naming, each with its constants."""
+    """Evidence, trust, omissions, common offsets, copies, observers and naming, each with its constants."""
 
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
     trust: TrustConfig = field(default_factory=TrustConfig)
@@ -92,7 +92,7 @@ class RayEvidenceDetector(MisbehaviourDetector):
     naming: NamingConfig = field(default_factory=NamingConfig)
     offset: OffsetConfig = field(default_factory=OffsetConfig)
     copies: CopyConfig = field(default_factory=CopyConfig)
-    witnesses: WitnessConfig = field(default_factory=WitnessConfig)
+    observers: ObserverConfig = field(default_factory=ObserverConfig)
 
     def excluded(self, state: object | None, agent_ids: Collection[int], now_ns: int) -> frozenset[int]:
         """Return the senders whose term of exclusion has not ended."""
@@ -114,7 +114,7 @@ class RayEvidenceDetector(MisbehaviourDetector):
         ]
         now, found = self._compare_messages(received, own, now)
         checked, omits = self._check(received, own, now, unclaimed, found)
-        checked = self._check_witnesses(received, detections, checked, now, found)
+        checked = self._check_observers(received, detections, checked, now, found)
         checks = [self._follow(one, now) for one in checked]
         now = replace(now, disputes=now.disputes.add(self._find_disputes(checked, checks, now), now.now_ns))
         if len(now.disputes.xy):
@@ -192,7 +192,7 @@ class RayEvidenceDetector(MisbehaviourDetector):
         ends = np.cumsum([0, *map(len, probes)])
         return checked, [is_in_sight(rays[a:b], self.omissions) for a, b in pairwise(ends)]
 
-    def _check_witnesses(
+    def _check_observers(
         self,
         received: MisbehaviourInput,
         detections: _Detections,
@@ -201,7 +201,7 @@ class RayEvidenceDetector(MisbehaviourDetector):
         found: _Findings,
     ) -> tuple[CheckedClaims, ...]:
         """Refute claims that the ego cannot check where trusted senders state free space; the ego's own evidence stays."""
-        if sum(message.sight is not None for message in received.messages) < self.witnesses.min_witnesses:
+        if sum(message.sight is not None for message in received.messages) < self.observers.min_observers:
             return checked
         unused = self.excluded(now, received.agent_ids, now.now_ns) | found.unused | received.faulty
         trusted = {
@@ -211,14 +211,14 @@ class RayEvidenceDetector(MisbehaviourDetector):
             and now.trust_of(one.claims.agent_id, self.trust).mean >= self.evidence.min_corroborating_trust
             and not self._is_accused(one, now)
         }
-        own = detections.boxes(self.witnesses.min_own_score)
+        own = detections.boxes(self.observers.min_own_score)
         copies = self.evidence.copy_m, self.evidence.max_copied
-        counts = count_witnesses(
-            received.frame, received.messages, received.claims, own, trusted, *copies, self.witnesses
+        counts = count_observers(
+            received.frame, received.messages, received.claims, own, trusted, *copies, self.observers
         )
         num_senders = len(set(received.agent_ids) - unused)
         return tuple(
-            one.refute(count >= self.witnesses.min_witnesses, 2 * count <= num_senders)
+            one.refute(count >= self.observers.min_observers, 2 * count <= num_senders)
             for one, count in zip(checked, counts)
         )
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Claims in the blind area of the ego, and witnesses whose sight states the place to be free::
+"""Claims in the blind area of the ego, and observers whose sight states the place to be free::
 
                         A (30, 30)
              |  wall      |
@@ -26,7 +26,7 @@ from tests.agents.trust.street import HEIGHT_M, SEEN, TENTH_NS, cars, kinds, sca
 from manyeyes.agents.trust.claims import Claims
 from manyeyes.agents.trust.detectors.ray_evidence import RayEvidenceDetector
 from manyeyes.agents.trust.interface import Assessment, Evidence, MisbehaviourInput, SenderStatus
-from manyeyes.agents.trust.witnesses import WitnessConfig
+from manyeyes.agents.trust.observers import ObserverConfig
 from manyeyes.datatypes import AgentFrame, Boxes, Message, PointCloud, Sight, Transform
 from manyeyes.datatypes.sight import NUM_SECTORS
 from manyeyes.ops.lidar.free_range import measure_sight
@@ -148,7 +148,7 @@ def test_the_sights_of_the_scene_are_what_they_should_be():
         assert (free > distance + 4) == is_open and blocked < distance
 
 
-def test_two_trusted_witnesses_refute_what_the_ego_cannot_see():
+def test_two_trusted_observers_refute_what_the_ego_cannot_see():
     found = after_trust(WITH_TWO).step(WITH_TWO)
     assert kinds(found, 1) == [Evidence.SUPPORTED, Evidence.SUPPORTED, REFUTED]
     assert kinds(found, 2) == kinds(found, 3) == [Evidence.SUPPORTED] * 2
@@ -159,21 +159,21 @@ def test_without_sights_it_stays_unchecked():
     assert ghost_kind(after_trust(blind).run(10, blind)) == UNCHECKED
 
 
-def test_one_witness_is_not_enough():
+def test_one_observer_is_not_enough():
     one = {**WITH_TWO, 3: replace(WITH_TWO[3], sight=None)}
     found = after_trust(one).run(10, one)
     assert ghost_kind(found) == UNCHECKED and sender(found, 1).status is NORMAL
     own_sight = {**one, 1: replace(CLAIMER, sight=ALL_FREE)}
-    assert ghost_kind(after_trust(own_sight).step(own_sight)) == UNCHECKED, "the claimer is no witness"
+    assert ghost_kind(after_trust(own_sight).step(own_sight)) == UNCHECKED, "the claimer is no observer"
 
 
-def test_a_witness_of_low_trust_is_not_enough():
-    assert ghost_kind(Crossing().step(WITH_TWO)) == UNCHECKED, "nobody is trusted yet"
+def test_a_observer_of_low_trust_is_not_enough():
+    assert ghost_kind(Crossing().step(WITH_TWO)) == UNCHECKED, "no sender is trusted yet"
     crossing = after_trust({1: CLAIMER, 2: WITH_TWO[2]})
     assert ghost_kind(crossing.step({**WITH_TWO, 3: replace(WITH_TWO[3], boxes=cars())})) == UNCHECKED
 
 
-def test_an_accused_or_faulty_witness_is_not_enough():
+def test_an_accused_or_faulty_observer_is_not_enough():
     refuted = {**WITH_TWO, 3: replace(WITH_TWO[3], boxes=honest(3, (12.0, -5.0)))}
     found = after_trust(WITH_TWO).step(refuted)
     assert kinds(found, 3)[2] == REFUTED and ghost_kind(found) == UNCHECKED
@@ -181,7 +181,7 @@ def test_an_accused_or_faulty_witness_is_not_enough():
 
 
 def test_an_honest_occluded_car_is_not_refuted():
-    """The free ranges of the witnesses end before it."""
+    """The free ranges of the observers end before it."""
     true = {1: CLAIMER, 2: sees(2, NORTH, CAR_THERE), 3: sees(3, EAST, CAR_THERE), 4: sees(4, SOUTH, CAR_THERE)}
     found = after_trust(true, has_car=True).run(20, true)
     assert ghost_kind(found) == UNCHECKED and sender(found, 1).trust > 0.8
@@ -189,21 +189,21 @@ def test_an_honest_occluded_car_is_not_refuted():
 
 
 @pytest.mark.parametrize("offset", [(3.8, 0.0), (-3.8, 0.0), (0.0, 3.8), (0.0, -3.8), (2.7, 2.7)])
-def test_pose_errors_of_witnesses_do_not_refute_a_true_car(offset):
+def test_pose_errors_of_observers_do_not_refute_a_true_car(offset):
     """Poses off by 3.8 m at a standard deviation of 0.7 m: five of them, and more than the width of the car."""
     true = {
         1: CLAIMER,
         2: sees(2, NORTH, CAR_THERE, error=offset, sigma_m=0.7),
         3: sees(3, EAST, CAR_THERE, error=offset, sigma_m=0.7),
     }
-    # Without the check by which the ego finds that both witnesses miss its own cars.
-    crossing = Crossing(True, detector=replace(DETECTOR, witnesses=WitnessConfig(min_own_score=1.1)))
+    # Without the check by which the ego finds that both observers miss its own cars.
+    crossing = Crossing(True, detector=replace(DETECTOR, observers=ObserverConfig(min_own_score=1.1)))
     crossing.run(5, without_ghost(true))
     assert ghost_kind(crossing.step(true)) == UNCHECKED
     assert ghost_kind(after_trust(true, has_car=True).step(true)) == UNCHECKED
 
 
-def test_a_witness_of_large_pose_error_concludes_nothing():
+def test_a_observer_of_large_pose_error_concludes_nothing():
     for options in ({"sigma_m": 1.2}, {"sigma_yaw": 0.08}):
         unsure = {**WITH_TWO, 3: replace(WITH_TWO[3], **options)}
         assert ghost_kind(after_trust(WITH_TWO).step(unsure)) == UNCHECKED
@@ -211,7 +211,7 @@ def test_a_witness_of_large_pose_error_concludes_nothing():
     assert ghost_kind(after_trust(WITH_TWO).step(small)) == REFUTED
 
 
-def test_a_turned_witness_counts_alike():
+def test_a_turned_observer_counts_alike():
     """A car beside the place leaves room for one along it, not across it."""
     beside = (WALL, cars(SEEN, SEEN_TOO, (GHOST[0], GHOST[1] - 3.6)))
     for yaw in (2.0, math.pi / 4, -math.pi / 4):
@@ -221,7 +221,7 @@ def test_a_turned_witness_counts_alike():
     assert ghost_kind(after_trust(WITH_TWO).step({**turned, 1: replace(CLAIMER, boxes=across)})) == UNCHECKED
 
 
-def test_claims_are_compared_at_the_time_of_the_sweep_of_a_late_witness():
+def test_claims_are_compared_at_the_time_of_the_sweep_of_a_late_observer():
     """A car of 25 m/s stood 7.5 m farther back 0.3 s before: there late sights end, and they state its place of now to be free."""
     before = (WALL, cars(SEEN, SEEN_TOO, (GHOST[0] - 7.5, GHOST[1])))
     moving = replace(honest(1, GHOST), velocity=torch.tensor([[0.0, 0.0], [0.0, 0.0], [25.0, 0.0]]).double())
@@ -231,12 +231,12 @@ def test_claims_are_compared_at_the_time_of_the_sweep_of_a_late_witness():
     assert ghost_kind(after_trust(late).step(driving)) == UNCHECKED
 
 
-def test_a_witness_on_another_level_concludes_nothing():
+def test_a_observer_on_another_level_concludes_nothing():
     above = {**WITH_TWO, 3: replace(WITH_TWO[3], height_m=2.0)}
     assert ghost_kind(after_trust(WITH_TWO).step(above)) == UNCHECKED
 
 
-def test_two_witnesses_that_copy_each_other_or_share_a_place_are_one():
+def test_two_observers_that_copy_each_other_or_share_a_place_are_one():
     copies = {**WITH_TWO, 3: replace(WITH_TWO[3], boxes=WITH_TWO[2].boxes)}
     # Not by an exact copy alone: the sights of both are their own.
     assert ghost_kind(after_trust(WITH_TWO).step(copies)) == UNCHECKED
@@ -245,7 +245,7 @@ def test_two_witnesses_that_copy_each_other_or_share_a_place_are_one():
     assert ghost_kind(after_trust(shared).step(shared)) == UNCHECKED
 
 
-def test_a_false_sight_refutes_neither_what_the_ego_sees_nor_what_one_other_witness_does_not_deny():
+def test_a_false_sight_refutes_neither_what_the_ego_sees_nor_what_one_other_observer_does_not_deny():
     """Agent 3 states that all is free; agent 1 claims a true car that the ego cannot see, agent 2 the one that it sees."""
     false = {1: CLAIMER, 2: sees(2, NORTH, CAR_THERE), 3: replace(sees(3, EAST, CAR_THERE), sight=ALL_FREE)}
     found = after_trust(false, has_car=True).run(20, false)
@@ -301,7 +301,7 @@ def test_two_colluders_that_are_the_majority_accuse_an_honest_sender():
     assert sender(found, 1).status is MALICIOUS
 
 
-def test_a_false_claimer_is_named_by_a_majority_of_witnesses_within_three_frames():
+def test_a_false_claimer_is_named_by_a_majority_of_observers_within_three_frames():
     many = {**WITH_TWO, 4: sees(4, SOUTH)}
     crossing = after_trust(many)
     first = crossing.step(many)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Witnesses: trusted senders whose sight states free space where another sender claims an object that the ego cannot see.
+"""Observers: trusted senders whose sight states free space where another sender claims an object that the ego cannot see.
 
 Source of the idea: free space that agents share, in Zhang et al. (CAD, USENIX Security 2024), and the perception regions of
-ETSI TS 103 324. A sight can be false, so one witness has no effect. Witnesses that copy each other, or state one place, are one.
+ETSI TS 103 324. A sight can be false, so one observer has no effect. Observers that copy each other, or state one place, are one.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ MIN_COPIED_CLAIMS = 2
 
 
 @dataclass(frozen=True)
-class WitnessConfig:
+class ObserverConfig:
     """When the sights of others refute a claim.
 
-    min_witnesses: trusted, independent, and neither the claimer nor accused. margin_m, num_sigmas: the footprint of the claim is
-    enlarged by margin_m and so many standard deviations of claim and witness together, of min_sigma_m or more, to max_margin_m;
+    min_observers: trusted, independent, and neither the claimer nor accused. margin_m, num_sigmas: the footprint of the claim is
+    enlarged by margin_m and so many standard deviations of claim and observer together, of min_sigma_m or more, to max_margin_m;
     beyond it nothing is concluded.
-    max_height_m: of the ground of the claim above or below that of the witness. min_apart_m: of witnesses that count as two.
+    max_height_m: of the ground of the claim above or below that of the observer. min_apart_m: of observers that count as two.
     min_own_score: of a detection of the ego; a sight that states it to be free is not used.
     """
 
-    min_witnesses: int = 2
+    min_observers: int = 2
     margin_m: float = 0.3
     num_sigmas: float = 2.0
     min_sigma_m: float = 0.3
@@ -53,7 +53,7 @@ class PlacedBoxes:
     sigma_m: Floats
 
 
-def count_witnesses(
+def count_observers(
     frame: AgentFrame,
     messages: Sequence[Message],
     claims: Sequence[Claims],
@@ -61,9 +61,9 @@ def count_witnesses(
     trusted: Set[int],
     copy_m: float,
     max_copied: float,
-    config: WitnessConfig,
+    config: ObserverConfig,
 ) -> list[Rows]:
-    """Return (N,) for the claims of each sender, how many independent witnesses state that their places are free.
+    """Return (N,) for the claims of each sender, how many independent observers state that their places are free.
 
     Args:
         messages: of the senders of the claims, in their order. own: the ego's detections of min_own_score. trusted: senders whose
@@ -72,22 +72,22 @@ def count_witnesses(
     """
     sights = [row for row, message in enumerate(messages) if message.sight is not None and message.agent_id in trusted]
     sights = [row for row in sights if not _states_free(frame, messages[row], own, config).any()]
-    if len(sights) < config.min_witnesses:
+    if len(sights) < config.min_observers:
         return [np.zeros(len(one), np.int64) for one in claims]
     source = _find_sources(claims, copy_m, max_copied, config.min_apart_m)
     counts = list[Rows]()
     for row, one in enumerate(claims):
         placed = PlacedBoxes(one.columns, one.velocity, one.sigma_m)
         states = dict[int, NDArray[np.bool_]]()
-        for witness in sights:
-            if source[witness] != source[row]:
-                found = _states_free(frame, messages[witness], placed, config)
-                states[source[witness]] = states.get(source[witness], np.zeros(len(one), np.bool_)) | found
+        for observer in sights:
+            if source[observer] != source[row]:
+                found = _states_free(frame, messages[observer], placed, config)
+                states[source[observer]] = states.get(source[observer], np.zeros(len(one), np.bool_)) | found
         counts.append(np.sum([np.zeros(len(one), np.int64), *states.values()], axis=0))
     return counts
 
 
-def _states_free(frame: AgentFrame, message: Message, boxes: PlacedBoxes, config: WitnessConfig) -> NDArray[np.bool_]:
+def _states_free(frame: AgentFrame, message: Message, boxes: PlacedBoxes, config: ObserverConfig) -> NDArray[np.bool_]:
     """Return (N,) which boxes the sight of a message states to be free."""
     if message.sight is None or not len(boxes.columns):
         return np.zeros(len(boxes.columns), np.bool_)
