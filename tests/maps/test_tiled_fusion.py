@@ -247,10 +247,10 @@ def test_what_the_driver_holds_grows_by_names_of_blocks_alone(tmp_path):
         index.add_segment("1.parquet", rows)
         job, nowhere = FusionJob(NoWork(), NoWork(), MapFusionConfig()), NoWork()
         tracemalloc.start()
-        stations = fuse_and(tuple, job, index, TiledFusionConfig(), nowhere)
+        fuse_and(tuple, job, index, TiledFusionConfig(), nowhere)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-        blocks.append(len(stations))
+        blocks.append(sum(1 for _ in iterate_blocks(index, TiledFusionConfig())))
     assert blocks[0] < 40 and blocks[1] > 100
     # An observation with its id and place takes some 300 bytes; a block of this density holds 25, a dense one thousands.
     assert (peaks[1] - peaks[0]) / (blocks[1] - blocks[0]) < 5000
