@@ -137,12 +137,18 @@ def agents_of_solutions(solutions, *_) -> list[str]:
     return [ids[name] for solution in solutions for name in solution.ids]
 
 
+def agents_of_stations(table, *_) -> list[str]:
+    ids = {bytes.fromhex(o.id): o.agent for o in (*HONEST, *HOSTILE)}
+    return [ids[row.tobytes()] for row in table.line_evidence.observations]
+
+
 @pytest.mark.parametrize(
     ("step", "agents_of"),
     [
         ("search_coarse_poses", agents_of_arrays),
         ("run_step", agents_of_arrays),
         ("build_stations", agents_of_arrays),
+        ("link_block", agents_of_stations),
         ("solve_domain", agents_of_solutions),
     ],
 )

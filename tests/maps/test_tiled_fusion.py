@@ -12,6 +12,7 @@ from manyeyes.datatypes import ConfigError
 from manyeyes.maps.formats.attributes import to_hex_ids
 from manyeyes.maps.fusion.fuse import MapFusionConfig, fuse
 from manyeyes.maps.fusion.observation_arrays import to_observation_arrays
+from manyeyes.maps.fusion.polyline_linking import LinkConfig
 from manyeyes.maps.fusion.pose_config import PoseSolverConfig
 from manyeyes.maps.fusion.pose_optimization import list_domains, solve_poses
 from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT
@@ -90,6 +91,26 @@ def test_poses_of_domains_that_meet_in_the_crossroads_do_not_depend_on_tiles(sto
     assert 0.0 < np.median(np.hypot(*moved[:, :2].T)) < 0.02
 
 
+@pytest.mark.slow
+def test_links_of_small_blocks_do_not_depend_on_tiles(store, crowd, whole, tmp_path):
+    # Borders lie at 40 m, 120 m and so on, and lines of the arms cross them.
+    config = MapFusionConfig(link=LinkConfig(block_m=80, block_halo_m=100.0))
+    one_piece = fuse(crowd.observations, config, crowd.place.frame)
+    got = _tiled(store, tmp_path / "work", 90.0, config=config)
+    assert _columns(got) == _columns(one_piece)
+    assert got.quantised_hash() == whole.quantised_hash()
+
+
+def _columns(vector_map):
+    """The bytes of elements, evidence and relations."""
+    e, t = vector_map.elements, vector_map.topology
+    return [
+        np.asarray(column).tobytes()
+        for column in (e.points, e.offsets, e.kind, e.score, e.sigma, e.style, vector_map.id, vector_map.log_odds,
+                       vector_map.state, vector_map.observations, vector_map.sources, t.successor, t.left, t.right, t.branch_xy)
+    ]  # fmt: skip
+
+
 def test_a_drive_that_is_supported_from_beyond_the_halo_is_refused():
     with pytest.raises(ConfigError, match=r"drive_support_m \(300 m\).*domain_halo_m \(200 m\).*lower .* or raise"):
         PoseSolverConfig(domain_halo_m=200.0)
@@ -117,15 +138,15 @@ def test_finished_steps_are_found_again_and_a_damaged_one_is_done_again(store, w
     _tiled(store, work, 256.0, progress=lambda name, done, total: seen.append((name, done, total)))
     steps = MapFusionConfig().pose_solver.num_steps
     assert [name for name, done, total in seen if done == total] == [
-        "search", *(f"step {k + 1}" for k in range(steps)), "stations",
+        "search", *(f"step {k + 1}" for k in range(steps)), "stations", "link",
     ]  # fmt: skip
     objects = FolderStore(work)
     schedule = MapFusionConfig().pose_solver.schedule
     joint = sum(step.joint is not None for step in schedule)
     results = objects.list("work")
     # Per block: its rows of the index, the search, pairs or a search a step, stations; of the one domain one a search and two a
-    # joint step; agents.
-    assert len(results) == 4 * (steps + 3) + (steps - joint + 1) + 2 * joint + steps and not [
+    # joint step; agents; links of the one block about the origin.
+    assert len(results) == 4 * (steps + 3) + (steps - joint + 1) + 2 * joint + steps + 1 and not [
         k for k in results if "/arrays/" in k
     ]
     before = {key: (work / key).stat().st_mtime_ns for key in results}
@@ -226,10 +247,10 @@ def test_what_the_driver_holds_grows_by_names_of_blocks_alone(tmp_path):
         index.add_segment("1.parquet", rows)
         job, nowhere = FusionJob(NoWork(), NoWork(), MapFusionConfig()), NoWork()
         tracemalloc.start()
-        stations = fuse_and(tuple, job, index, TiledFusionConfig(), nowhere)
+        fuse_and(tuple, job, index, TiledFusionConfig(), nowhere)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-        blocks.append(len(stations))
+        blocks.append(sum(1 for _ in iterate_blocks(index, TiledFusionConfig())))
     assert blocks[0] < 40 and blocks[1] > 100
     # An observation with its id and place takes some 300 bytes; a block of this density holds 25, a dense one thousands.
     assert (peaks[1] - peaks[0]) / (blocks[1] - blocks[0]) < 5000

@@ -28,11 +28,14 @@ def find_observed_cells(
     Returns runs (R, 3): row, first column and last column of cells, ascending; no two runs touch.
     """
     runs = fill_rings(arrays.view_corners_in_world(pose), arrays.view.ring_offsets)
-    if area is not None:
-        x0, y0, x1, y1 = np.floor(np.array(area) / CELL_M + 0.5).astype(np.int64)
-        runs = runs[(runs[:, 0] >= y0) & (runs[:, 0] < y1) & (runs[:, 1] < x1) & (runs[:, 2] >= x0)]
-        runs = np.stack((runs[:, 0], np.maximum(runs[:, 1], x0), np.minimum(runs[:, 2], x1 - 1)), 1)
-    return merge_runs(runs)
+    return merge_runs(runs if area is None else clip_runs(runs, area))
+
+
+def clip_runs(runs: Ints, area: tuple[float, float, float, float]) -> Ints:
+    """Return the parts of runs (R, 3) inside an area (x0, y0, x1, y1; whole metres)."""
+    x0, y0, x1, y1 = np.floor(np.array(area) / CELL_M + 0.5).astype(np.int64)
+    runs = runs[(runs[:, 0] >= y0) & (runs[:, 0] < y1) & (runs[:, 1] < x1) & (runs[:, 2] >= x0)]
+    return np.stack((runs[:, 0], np.maximum(runs[:, 1], x0), np.minimum(runs[:, 2], x1 - 1)), 1)
 
 
 def find_cells_under_lines(points: Floats, offsets: Ints) -> Ints:

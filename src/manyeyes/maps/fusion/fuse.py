@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fuse many observations into one map: align poses, build stations, link them to lines, keep their evidence.
 
-The steps are :func:`manyeyes.maps.fusion.pose_optimization.solve_poses`, :func:`manyeyes.maps.fusion.stations.build_stations`
-and :func:`assemble_map`. The first two are local and may run tile by tile. The third takes the stations of all tiles, which are
-few, so no line is cut at a border. The map is a pure function of the set of observations: repetition and order have no effect,
-and removing an observation gives the map without it.
+The steps are :func:`manyeyes.maps.fusion.pose_optimization.solve_poses`, :func:`manyeyes.maps.fusion.stations.build_stations`,
+:func:`manyeyes.maps.fusion.block_linking.link_in_blocks` and :func:`assemble_linked`. The first three are local and may run tile by
+tile. The fourth takes the linked stations of all blocks, so no line is cut at a border. The map is a pure function of the set of
+observations: repetition and order have no effect, and removing an observation gives the map without it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx1, I64x1, njit
-from manyeyes.datatypes.map_element import DASHED, MapElements, take_rows
+from manyeyes.datatypes.map_element import MapElements, take_rows
 from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import (
     CANDIDATE,
@@ -27,11 +27,12 @@ from manyeyes.maps.elements.vector_map import (
     VectorMap,
     compute_content_ids,
 )
+from manyeyes.maps.fusion.block_linking import LinkedStations, link_in_blocks
 from manyeyes.maps.fusion.coverage import cut_unobserved
 from manyeyes.maps.fusion.existence import EvidenceTable
 from manyeyes.maps.fusion.observation_arrays import to_observation_arrays
-from manyeyes.maps.fusion.parallel_extension import ParallelExtensionConfig, extend_parallel
-from manyeyes.maps.fusion.polyline_linking import LinkConfig, link_stations, smooth_chains
+from manyeyes.maps.fusion.parallel_extension import ParallelExtensionConfig
+from manyeyes.maps.fusion.polyline_linking import LinkConfig, smooth_chains, trace_chains
 from manyeyes.maps.fusion.pose_config import PoseSolverConfig
 from manyeyes.maps.fusion.pose_optimization import solve_poses
 from manyeyes.maps.fusion.pose_solution import PoseSolution
@@ -88,10 +89,16 @@ def assemble_map(
     table: StationTable, config: MapFusionConfig = MapFusionConfig(), frame: MapFrame | None = None
 ) -> VectorMap:
     """Assemble the map from the stations of all areas; retired stations are linked separately."""
-    parts = [
-        _build_lines(table, table.line_evidence.state != RETIRED, config),
-        _build_lines(table, table.line_evidence.state == RETIRED, config),
-    ]
+    return assemble_linked(link_in_blocks(table, config.link, config.parallel_extension), config, frame)
+
+
+def assemble_linked(
+    stations: LinkedStations, config: MapFusionConfig = MapFusionConfig(), frame: MapFrame | None = None
+) -> VectorMap:
+    """Assemble the map from the linked stations of all blocks."""
+    table = stations.table
+    is_retired = table.line_evidence.state == RETIRED
+    parts = [_build_lines(stations, np.flatnonzero(chosen), config) for chosen in (~is_retired, is_retired)]
     whole = _ElementParts.cat([*parts, _build_crossings(table)])
     return _to_vector_map(whole, EvidenceTable.cat([table.line_evidence, table.ring_evidence]), frame or MapFrame())
 
@@ -120,54 +127,29 @@ class _ElementParts:
         )
 
 
-def _build_lines(table: StationTable, chosen: NDArray[np.bool_], config: MapFusionConfig) -> _ElementParts:
-    rows = np.flatnonzero(chosen)
-    xy, tangent = table.xy[rows], table.tangent[rows]
-    offsets, members = _link_stations(table, rows, xy, tangent, config)
-    num_observed = len(rows)
-    added, turned, source = extend_parallel(
-        xy,
-        table.line_evidence.kind[rows],
-        table.line_evidence.coverage[rows],
-        (offsets, members),
-        config.parallel_extension,
-    )
-    if len(added):
-        xy, tangent, rows = (
-            np.concatenate((xy, added)),
-            np.concatenate((tangent, turned)),
-            np.concatenate((rows, rows[source])),
-        )
-        offsets, members = _link_stations(table, rows, xy, tangent, config)
-    kind, weight = table.line_evidence.kind[rows], 1.0 / table.line_evidence.sigma[rows] ** 2
-    points = smooth_chains(xy, offsets, members, weight, config.link.smoothing_sigma)
-    offsets, kept_points = cut_unobserved(points, offsets, members >= num_observed, table.observed_cells)
+def _build_lines(stations: LinkedStations, rows: Ints, config: MapFusionConfig) -> _ElementParts:
+    """Build the lines of the chosen stations, to which they alone are linked."""
+    table = stations.table
+    line = table.line_evidence
+    place = np.full(len(table) + 1, -1)
+    place[rows] = np.arange(len(rows))
+    offsets, members = trace_chains(place[stations.linked[rows]], line.log_odds[rows])
+    members = rows[members]
+    points = smooth_chains(table.xy, offsets, members, 1.0 / line.sigma**2, config.link.smoothing_sigma)
+    is_inferred = ~stations.is_observed[members]
+    offsets, kept_points = cut_unobserved(points, offsets, is_inferred, table.observed_cells)
     points, members = points[kept_points], members[kept_points]
     offsets, order = _canonical_order(offsets, points)
     points, members = points[order], members[order]
     length = _lengths(offsets, points)
-    line_kind = kind[members[offsets[:-1]]] if len(members) else np.zeros(0, np.int64)
-    mean = (
-        np.add.reduceat(table.line_evidence.log_odds[rows][members], offsets[:-1]) / np.diff(offsets)
-        if len(members)
-        else np.zeros(0)
-    )
+    line_kind = line.kind[members[offsets[:-1]]] if len(members) else np.zeros(0, np.int64)
+    mean = np.add.reduceat(line.log_odds[members], offsets[:-1]) / np.diff(offsets) if len(members) else np.zeros(0)
     share = np.minimum(1.0, length / np.array(config.full_score_length_m)[line_kind].clip(1e-9))
     score = share / (1.0 + np.exp(-mean / 4.0))
     stays = np.flatnonzero(length >= np.array(config.min_length_m)[line_kind])
     kept_points, places = take_rows(offsets, stays)
-    return _ElementParts(
-        points[places], kept_points, rows[members[places]], members[places] < num_observed, score[stays]
-    )
-
-
-def _link_stations(
-    table: StationTable, rows: Ints, xy: Floats, tangent: Floats, config: MapFusionConfig
-) -> tuple[Ints, Ints]:
-    """Chains of stations at xy with the evidence of the table's rows."""
-    line = table.line_evidence
-    dashed = line.style[rows].argmax(1) == DASHED
-    return link_stations(xy, tangent, line.kind[rows], line.log_odds[rows], dashed, line.coverage[rows], config.link)
+    members = members[places]
+    return _ElementParts(points[places], kept_points, members, stations.is_observed[members], score[stays])
 
 
 def _build_crossings(table: StationTable) -> _ElementParts:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx2, F64x1, F64x2, I64x1, I64x2, I64x3, njit
+from manyeyes.datatypes import ConfigError
 from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, find_cell_range, line_residual
 
 Floats = NDArray[np.float64]
@@ -42,6 +43,9 @@ class LinkConfig:
     max_low_coverage_heading_rad: largest turn over gaps of max_low_coverage_gap_m.
     lateral_cost: metres of gap that a metre of lateral gap costs.
     smoothing_sigma: Gaussian scale, in stations, of the local parabola.
+    block_m, block_halo_m: the ground is divided into squares of this side, whole metres and even, the origin in the middle of one;
+        the links in one are those of the stations in it and up to the halo around it
+        (:mod:`manyeyes.maps.fusion.block_linking`). The halo covers two extensions that meet, and what they were found with.
     """
 
     max_gap_m: float = 6.0
@@ -59,6 +63,15 @@ class LinkConfig:
     max_low_coverage_heading_rad: float = 0.6
     lateral_cost: float = 4.0
     smoothing_sigma: float = 2.0
+    block_m: int = 512
+    block_halo_m: float = 256.0
+
+    def __post_init__(self) -> None:
+        if not (self.block_m >= 2 and self.block_m % 2 == 0 and self.block_halo_m >= 0):
+            raise ConfigError(
+                "LinkConfig needs a block_m of whole metres, even and above 0, and a block_halo_m of at least 0; "
+                f"got {self.block_m} and {self.block_halo_m}."
+            )
 
 
 def link_stations(
@@ -74,6 +87,19 @@ def link_stations(
 
     Every station is in exactly one chain. coverage: (K,) summed visibility. A closed loop is opened at its weakest station.
     """
+    return trace_chains(find_links(xy, tangent, kind, log_odds, dashed, coverage, config), log_odds)
+
+
+def find_links(
+    xy: Floats,
+    tangent: Floats,
+    kind: Ints,
+    log_odds: Floats,
+    dashed: Flags,
+    coverage: Floats,
+    config: LinkConfig = LinkConfig(),
+) -> Ints:
+    """Find the links of stations, as :func:`link_stations`: (K, 2) the row linked in front of and behind its tangent, or -1."""
     gates = _LinkGates(
         config.max_lateral_m,
         config.lateral_slope,
@@ -81,8 +107,7 @@ def link_stations(
         config.heading_slope,
         config.lateral_cost,
     )
-    pair = _find_links(xy, tangent, kind, np.ones((len(xy), 2), np.bool_), config.max_gap_m, gates)
-    offsets, members = _trace_chains(pair, log_odds)
+    pair = _pair_neighbours(xy, tangent, kind, np.ones((len(xy), 2), np.bool_), config.max_gap_m, gates)
     lateral = (config.max_end_lateral_m, config.end_lateral_slope)
     near = _LinkGates(*lateral, config.max_heading_rad, config.heading_slope, config.lateral_cost)
     far = _LinkGates(*lateral, config.max_low_coverage_heading_rad, 0.0, config.lateral_cost)
@@ -92,6 +117,7 @@ def link_stations(
         (config.max_low_coverage_gap_m, far, coverage <= config.max_coverage),
     )
     for max_gap, gates, allowed in rounds:
+        offsets, members = trace_chains(pair, log_odds)
         ends = np.unique(np.concatenate((members[offsets[:-1]], members[offsets[1:] - 1])))
         ends = ends[allowed[ends]]
         direction = _end_tangents(xy, tangent, offsets, members)
@@ -102,11 +128,10 @@ def link_stations(
                 pair, joined, xy, tangent, guides, (config.max_join_gap_m, config.max_guide_m)
             )
         pair = joined
-        offsets, members = _trace_chains(pair, log_odds)
-    return offsets, members
+    return pair
 
 
-def _find_links(
+def _pair_neighbours(
     xy: Floats, tangent: Floats, kind: Ints, free: NDArray[np.bool_], max_gap: float, gates: _LinkGates
 ) -> Ints:
     """Return (K, 2): the station linked in front of and behind each one's own tangent, or -1; free: (K, 2) sides to link."""
@@ -121,7 +146,7 @@ def _join_ends(
     """Links with those of a second round added: free ends only; direction: (K, 2) of the line over its last stations."""
     free = (pair < 0)[ends]
     # A tangent that was turned round for the fit turns front and back round with it.
-    more = _find_links(xy[ends], direction[ends], kind[ends], free, max_gap, gates)
+    more = _pair_neighbours(xy[ends], direction[ends], kind[ends], free, max_gap, gates)
     added = pair.copy()
     for side in range(2):
         rows = np.flatnonzero((more[:, side] >= 0) & free[:, side])
@@ -254,7 +279,7 @@ def _select_mutual(best: I64x3) -> I64x2:  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def _trace_chains(pair: I64x2, log_odds: F64x1) -> tuple[I64x1, I64x1]:  # pragma: no cover - compiled
+def trace_chains(pair: I64x2, log_odds: F64x1) -> tuple[I64x1, I64x1]:  # pragma: no cover - compiled
     """Chains of linked stations: offsets and rows; open chains first by their smallest end, then loops, opened where
     weakest.
     """

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from manyeyes._jit import Boolx1, F64x2, I64x1, njit
 from manyeyes.datatypes.map_element import STYLES, take_rows
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED
-from manyeyes.maps.fusion.coverage import find_observed_cells, merge_runs
+from manyeyes.maps.fusion.coverage import clip_runs, find_observed_cells, merge_runs
 from manyeyes.maps.fusion.crossings import CrossingConfig, FusedCrossings, fuse_crossings
 from manyeyes.maps.fusion.existence import (
     POINT_VARIANCE_M2,
@@ -108,6 +108,22 @@ class StationTable:
         observed_cells = merge_runs(np.concatenate([t.observed_cells for t in tables]))
         return cls(
             xy[order], tangent[order], line.take(order), ring_offsets, points[places], ring.take(rings), observed_cells
+        )
+
+    def take_area(self, area: Area, halo_m: float) -> StationTable:
+        """Return what stands in an area widened by a halo, in order; a crossing stands where its first point is."""
+        rows = np.flatnonzero(_within(self.xy, area, halo_m))
+        rings = np.flatnonzero(_within(self.ring_xy[self.ring_offsets[:-1]], area, halo_m))
+        ring_offsets, places = take_rows(self.ring_offsets, rings)
+        wide = (area[0] - halo_m, area[1] - halo_m, area[2] + halo_m, area[3] + halo_m)
+        return StationTable(
+            self.xy[rows],
+            self.tangent[rows],
+            self.line_evidence.take(rows),
+            ring_offsets,
+            self.ring_xy[places],
+            self.ring_evidence.take(rings),
+            clip_runs(self.observed_cells, wide),
         )
 
 

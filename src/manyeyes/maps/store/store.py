@@ -45,7 +45,7 @@ from manyeyes.maps.store.tiled_fusion import (
     FusionJob,
     StepProgress,
     TiledFusionConfig,
-    assemble_stations,
+    assemble_blocks,
     fuse_and,
 )
 
@@ -151,8 +151,8 @@ class MapStore:
             while True:
                 watermark = _watermark_of(log.index.iterate_active())
 
-                def write(stations: tuple[str, ...], watermark: Watermark = watermark) -> Manifest:
-                    part = _Release(job, self.published, stations, watermark)
+                def write(blocks: tuple[str, ...], watermark: Watermark = watermark) -> Manifest:
+                    part = _Release(job, self.published, blocks, watermark)
                     return map_blocks(_write_release, [part], session)[0]
 
                 try:
@@ -187,17 +187,17 @@ class MapStore:
 
 @dataclass(frozen=True, eq=False)
 class _Release:
-    """What a worker needs to write a release: the stations of all blocks (keys of the job's work), and of what they were made."""
+    """What a worker needs to write a release: the linked stations of all blocks (keys of the job's work), and their watermark."""
 
     job: FusionJob
     published: ReleaseStore
-    stations: tuple[str, ...]
+    blocks: tuple[str, ...]
     watermark: Watermark
 
 
 def _write_release(part: _Release) -> Manifest:
-    """Link the stations of all blocks and write the tiles."""
-    fused = assemble_stations(part.job, part.stations, part.published.frame)
+    """Stitch the links of all blocks, assemble the map and write the tiles."""
+    fused = assemble_blocks(part.job, part.blocks, part.published.frame)
     return part.published.write(fused, ALGORITHM, repr(part.job.config), part.watermark)
 
 

@@ -3,8 +3,9 @@
 
 The ground is divided into blocks of tiles. A block aligns its home observations, given all that their lines can meet: a coarse
 search, then sums of pairs, of which the poses are solved domain by domain (:mod:`manyeyes.maps.fusion.pose_optimization`). Last it
-builds the stations of its area from all observations that reach into it. One worker links the stations of all blocks, which are
-few, so that no line is cut at a border.
+builds the stations of its area from all observations that reach into it. Stations are linked in blocks that the configuration of
+the fusion fixes (:mod:`manyeyes.maps.fusion.block_linking`), each from the stations within its halo. One worker stitches the links
+at borders and assembles the map, so that no line is cut there.
 
 Every step is a pure function of objects in a store: a worker reads them, and writes its result to the store under a name that holds
 a hash of what it was made from and one of its content. So poses pass between neighbours alone, and this process holds the names
@@ -30,7 +31,8 @@ from manyeyes.datatypes import ConfigError
 from manyeyes.maps.elements.observation import MapFrame
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.fusion.agent_weights import AgentSums, AgentWeights, apply_agents
-from manyeyes.maps.fusion.fuse import MapFusionConfig, assemble_map
+from manyeyes.maps.fusion.block_linking import LinkedStations, find_block_area, link_block, list_blocks, stitch_blocks
+from manyeyes.maps.fusion.fuse import MapFusionConfig, assemble_linked
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays, to_observation_arrays
 from manyeyes.maps.fusion.pose_optimization import (
     find_domain_area,
@@ -120,6 +122,7 @@ class _Plan:
     """
 
     place: Place
+    area: Area
     members: str
     domains: tuple[Place, ...]
     home_domains: tuple[Place, ...]
@@ -127,7 +130,10 @@ class _Plan:
 
 @dataclass(frozen=True)
 class StepTask:
-    """One step of one place, a pure function of the objects under ``inputs`` and ``agents`` (a table of agents; "": none yet)."""
+    """One step of one place, a pure function of the objects under ``inputs`` and ``agents`` (a table of agents; "": none yet).
+
+    origins: of a link, what each input was made from: the same keys as those of its own step. They are read where the link fails.
+    """
 
     job: FusionJob
     kind: str
@@ -135,6 +141,7 @@ class StepTask:
     number: int
     inputs: tuple[str, ...]
     agents: str = ""
+    origins: tuple[tuple[str, ...], ...] = ()
 
     @property
     def folder(self) -> str:
@@ -173,14 +180,14 @@ def fuse_tiles(
     tile_config: TiledFusionConfig = TiledFusionConfig(),
     progress: StepProgress | None = None,
 ) -> VectorMap:
-    """Fuse the observations of a log that count, and link them in this process.
+    """Fuse the observations of a log that count, and assemble the map in this process.
 
     Raises:
         FailedObservationsError: the fusion fails with some observations; without them it may succeed.
     """
 
-    def assemble(stations: Sequence[str]) -> VectorMap:
-        return assemble_stations(job, stations, frame)
+    def assemble(blocks: Sequence[str]) -> VectorMap:
+        return assemble_blocks(job, blocks, frame)
 
     return fuse_and(assemble, job, index, tile_config, session, progress)
 
@@ -193,7 +200,7 @@ def fuse_and(
     session: ExecutorSession,
     progress: StepProgress | None = None,
 ) -> T:
-    """Compute the stations of all blocks and give the keys of their tables to ``use``; again where a result is damaged.
+    """Link the stations of all blocks and give the keys of the results to ``use``; again where a result is damaged.
 
     Raises:
         FailedObservationsError: the fusion fails with some observations; without them it may succeed.
@@ -212,12 +219,11 @@ def fuse_and(
             job.work.delete([error.key])
 
 
-def assemble_stations(job: FusionJob, stations: Sequence[str], frame: MapFrame) -> VectorMap:
-    """Link the stations of all blocks to a map; LostResultError where a table is missing or damaged."""
-    if not stations:
+def assemble_blocks(job: FusionJob, blocks: Sequence[str], frame: MapFrame) -> VectorMap:
+    """Assemble the map from the linked stations of all blocks; LostResultError where a result is missing or damaged."""
+    if not blocks:
         return VectorMap.empty(frame)
-    tables = [_load(job, key, StationTable) for key in stations]
-    return assemble_map(StationTable.cat(tables), job.config, frame)
+    return assemble_linked(stitch_blocks([_load(job, key, LinkedStations) for key in blocks]), job.config, frame)
 
 
 def iterate_blocks(index: LogIndex, tile_config: TiledFusionConfig) -> Iterator[TileBlock]:
@@ -253,6 +259,7 @@ def _make_plans(job: FusionJob, index: LogIndex, tile_config: TiledFusionConfig)
         plans.append(
             _Plan(
                 block.place,
+                block.area,
                 key,
                 tuple(list_domains(xy, solver)),
                 tuple(list_domains(xy[home], solver)) if home.any() else (),
@@ -272,7 +279,7 @@ class _Run:
     progress: StepProgress | None
 
     def run(self) -> tuple[str, ...]:
-        """Run the search, the steps of the schedule and the stations; the keys of the tables of stations."""
+        """Run the search, the steps of the schedule, the stations and their links; the keys of the linked stations."""
         if not self.plans:
             return ()
         homes = [plan for plan in self.plans if plan.home_domains]
@@ -309,7 +316,28 @@ class _Run:
             poses = dict(zip(domains, (keys[0] for keys in solved)))
             agents = self._weigh(number, [keys[1] for keys in solved], agents)
         tasks = (task("stations", p.place, 0, read_by(p), agents) for p in self.plans)
-        return tuple(keys[0] for keys in self._map("stations", tasks, len(self.plans)))
+        stations = [keys[0] for keys in self._map("stations", tasks, len(self.plans))]
+        made_from = [(agents, *read_by(p)) for p in self.plans]
+        blocks = self._blocks_to_link()
+        tasks = (
+            task("link", block, 0, tuple(stations[k] for k in rows), "", tuple(made_from[k] for k in rows))
+            for block, rows in blocks.items()
+        )
+        return tuple(keys[0] for keys in self._map("link", tasks, len(blocks)))
+
+    def _blocks_to_link(self) -> dict[Place, tuple[int, ...]]:
+        """Return the blocks in which stations are linked, each with the plans whose stations may lie within its halo."""
+        config, side = self.job.config.link, self.tile_config.block_m
+        rows = {plan.place: row for row, plan in enumerate(self.plans)}
+        out = {}
+        for block in list_blocks((plan.area for plan in self.plans), config):
+            x0, y0, x1, y1 = find_block_area(block, config)
+            halo = config.block_halo_m
+            ranges = (
+                range(int((low - halo) // side), int((high + halo) // side) + 1) for low, high in ((x0, x1), (y0, y1))
+            )
+            out[block] = tuple(rows[place] for place in product(*ranges) if place in rows)
+        return out
 
     def _blocks_of_domains(self, homes: Sequence[_Plan]) -> dict[Place, tuple[Place, ...]]:
         """Return the blocks whose home observations may lie within the halo of each domain, by column and row."""
@@ -383,9 +411,9 @@ def _compute(task: StepTask) -> tuple[dict[str, object], tuple[FailedObservation
         return {"poses": settle_domain(parts, task.place, solver)}, ()
     if task.kind == "solve":
         return _compute_solve(task)
-    block = _load(job, task.inputs[0], TileBlock)
-    poses = [_load(job, key, PoseSolution) for key in task.inputs[1:]]
-    solution = apply_agents(PoseSolution.cat(poses), table) if poses else None
+    if task.kind == "link":
+        return _compute_link(task)
+    block, solution = _load_block(job, task.inputs, table)
     try:
         return _compute_block(task, block, _load_arrays(task, block), solution, table), ()
     except CONTENT_ERRORS:
@@ -404,6 +432,56 @@ def _compute_solve(task: StepTask) -> tuple[dict[str, object], tuple[FailedObser
     (state, sums), failures = isolate_failures(solve, len(whole.ids))
     found = tuple(FailedObservation(whole.ids[one.row], one.reason) for one in failures)
     return {"poses": state, "sums": sums}, found
+
+
+def _load_block(
+    job: FusionJob, keys: Sequence[str], table: AgentWeights | None
+) -> tuple[TileBlock, PoseSolution | None]:
+    """Load a block and the poses of what it reads, if there are keys of them."""
+    poses = [_load(job, key, PoseSolution) for key in keys[1:]]
+    return _load(job, keys[0], TileBlock), apply_agents(PoseSolution.cat(poses), table) if poses else None
+
+
+def _compute_link(task: StepTask) -> tuple[dict[str, object], tuple[FailedObservation, ...]]:
+    """Link the stations of a block, or find the observations without whose stations that succeeds."""
+    config = task.job.config
+
+    def link(tables: Sequence[StationTable]) -> dict[str, object]:
+        return {"links": link_block(StationTable.cat(tables), task.place, config.link, config.parallel_extension)}
+
+    area, halo = find_block_area(task.place, config.link), config.link.block_halo_m
+    tables = [_load(task.job, key, StationTable).take_area(area, halo) for key in task.inputs]
+    try:
+        return link(tables), ()
+    except CONTENT_ERRORS:
+        return _isolate_link(task, link)
+
+
+def _isolate_link(
+    task: StepTask, link: Callable[[Sequence[StationTable]], dict[str, object]]
+) -> tuple[dict[str, object], tuple[FailedObservation, ...]]:
+    """Link stations made without the observations with which linking fails; raises its error where that does not help."""
+    config = task.job.config
+    origins = []
+    for agents, *keys in task.origins:
+        block, solution = _load_block(task.job, keys, _load(task.job, agents, AgentWeights) if agents else None)
+        stored = read_active(task.job.log, block.observations, np.arange(len(block.observations)))
+        origins.append((block, solution, stored))
+    ids = sorted({o.id for _, _, stored in origins for o in stored})
+
+    def compute(rows: Sequence[int]) -> dict[str, object]:
+        chosen, tables = {ids[row] for row in rows}, []
+        for block, solution, stored in origins:
+            part = [o for o in stored if o.id in chosen]
+            if part:
+                arrays = to_observation_arrays(part, config.pose_solver.spacing_m)
+                made = _compute_block(replace(task, kind="stations"), block, arrays, solution, None)["stations"]
+                assert isinstance(made, StationTable)
+                tables.append(made)
+        return link(tables)
+
+    results, failures = isolate_failures(compute, len(ids))
+    return results, tuple(FailedObservation(ids[one.row], one.reason) for one in failures)
 
 
 def _compute_block(
