@@ -52,13 +52,13 @@ def find_block_area(block: Place, config: LinkConfig) -> Area:
 
 def list_blocks(areas: Iterable[Area], config: LinkConfig) -> list[Place]:
     """List the blocks that areas overlap, ascending."""
-    found: set[Place] = set()
+    side, found = config.block_m, set[Place]()
     for x0, y0, x1, y1 in areas:
-        ranges = (
-            range(int(low // config.block_m), int(-(-high // config.block_m)))
-            for low, high in ((v + config.block_m / 2, w + config.block_m / 2) for v, w in ((x0, x1), (y0, y1)))
+        columns, rows = (
+            range(int((low + side / 2) // side), int(-(-(high + side / 2) // side)))
+            for low, high in ((x0, x1), (y0, y1))
         )
-        found.update(product(*ranges))
+        found.update(product(columns, rows))
     return sorted(found)
 
 
@@ -89,7 +89,8 @@ def link_block(
     is_retired = near.line_evidence.state == RETIRED
     parts = [_link_rows(near, np.flatnonzero(chosen), config, extension) for chosen in (~is_retired, is_retired)]
     starts = np.cumsum([0, *(len(rows) for _, _, rows, _, _ in parts)])
-    xy, tangent, rows, is_observed = (np.concatenate([part[k] for part in parts]) for k in range(4))
+    xy, tangent = np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+    rows, is_observed = np.concatenate([part[2] for part in parts]), np.concatenate([part[3] for part in parts])
     linked = np.concatenate([np.where(part[4] >= 0, part[4] + start, -1) for part, start in zip(parts, starts)])
     x0, y0, x1, y1 = area
     inside = (xy[:, 0] >= x0) & (xy[:, 0] < x1) & (xy[:, 1] >= y0) & (xy[:, 1] < y1)

@@ -333,10 +333,10 @@ class _Run:
         for block in list_blocks((plan.area for plan in self.plans), config):
             x0, y0, x1, y1 = find_block_area(block, config)
             halo = config.block_halo_m
-            ranges = (
+            columns, lines = (
                 range(int((low - halo) // side), int((high + halo) // side) + 1) for low, high in ((x0, x1), (y0, y1))
             )
-            out[block] = tuple(rows[place] for place in product(*ranges) if place in rows)
+            out[block] = tuple(rows[place] for place in product(columns, lines) if place in rows)
         return out
 
     def _blocks_of_domains(self, homes: Sequence[_Plan]) -> dict[Place, tuple[Place, ...]]:
