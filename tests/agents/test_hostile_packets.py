@@ -76,18 +76,21 @@ WRONG = {
 }
 
 
+@pytest.fixture(scope="module")
+def honest_packets(drive, detector) -> list[list[bytes]]:
+    """What an honest sender shares at each of 14 instants: it receives nothing, so it is the same in every drive."""
+    sender = Agent(detector, get_strategy("intermediate-temporal"), token_encoding="float32")
+    return [sender.share(drive(2).frame(1, index)) for index in range(14)]
+
+
 def drive_through(
-    detector, drive, name: str, hostile: Iterable[tuple[int, bytes]], own_inbox: bool
+    detector, drive, honest: list[list[bytes]], hostile: Iterable[tuple[int, bytes]], own_inbox: bool
 ) -> list[tuple[Boxes, list]]:
     """What an ego perceives in 14 instants, with an honest sender beside it, and hostile packets (instant, bytes) among them."""
-    some, ego, sender = (
-        drive(2),
-        Agent(detector, get_strategy(name)),
-        Agent(detector, get_strategy(name), token_encoding="float32"),
-    )
+    some, ego = drive(2), Agent(detector, get_strategy("intermediate-temporal"))
     inbox, found = Inbox(detector.fingerprint), []
     for index in range(14):
-        packets = [p for at, p in hostile if at == index] + sender.share(some.frame(1, index))
+        packets = [p for at, p in hostile if at == index] + honest[index]
         frame = some.frame(0, index)
         if own_inbox:
             for packet in packets:
@@ -100,22 +103,22 @@ def drive_through(
 
 
 @pytest.fixture(scope="module")
-def undisturbed(drive, detector) -> dict[bool, list[tuple[Boxes, list]]]:
+def undisturbed(drive, detector, honest_packets) -> dict[bool, list[tuple[Boxes, list]]]:
     """What an ego perceives without hostile packets, by whether the caller keeps the inbox."""
-    return {own: drive_through(detector, drive, "intermediate-temporal", [], own) for own in (False, True)}
+    return {own: drive_through(detector, drive, honest_packets, [], own) for own in (False, True)}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("own_inbox", [False, True], ids=["packets", "an inbox of the caller"])
 @pytest.mark.parametrize("what", WRONG)
 def test_one_whole_packet_of_wrong_tokens_changes_nothing(
-    drive, detector, undisturbed, what: str, own_inbox: bool
+    drive, detector, honest_packets, undisturbed, what: str, own_inbox: bool
 ) -> None:
     """It raised in perceive, and again for as long as the history kept it."""
     honest = Agent(detector, token_encoding="float32").share(drive(2).frame(1, 2))[0]
     packet = forged(honest, 66, hostile_bodies(honest)[what], time_ns=2 * TENTH_NS)
     clean = undisturbed[own_inbox]
-    struck = drive_through(detector, drive, "intermediate-temporal", [(2, packet)], own_inbox)
+    struck = drive_through(detector, drive, honest_packets, [(2, packet)], own_inbox)
     assert all(torch.equal(a.bev(), b.bev()) and torch.equal(a.score, b.score) for (a, _), (b, _) in zip(clean, struck))
     assert [names for _, names in clean] == [[]] * 14
     assert struck[2][1] == [(66, WRONG[what])]

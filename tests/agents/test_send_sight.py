@@ -63,7 +63,7 @@ def test_the_budget_includes_it(detector, frames, budget):
     assert SIGHT_PACKET_BYTES == 248
 
 
-def test_boxes_do_not_change_where_nobody_assesses_senders(detector, frames):
+def test_boxes_do_not_change_where_no_agent_assesses_senders(detector, frames):
     def boxes(send_sight: bool) -> torch.Tensor:
         packets = Agent(detector, get_strategy("late"), send_sight=send_sight).share(frames[1])
         return Agent(detector, get_strategy("late")).perceive(frames[0], packets).boxes.bev()

@@ -280,7 +280,7 @@ TWO_COLLUDE = {
 """Agents 2 and 3 collude; 1, 4 and 5 are honest, and only 1 detects the hidden car."""
 
 
-def test_two_colluders_in_an_honest_majority_remove_a_hidden_car_but_accuse_nobody():
+def test_two_colluders_in_an_honest_majority_remove_a_hidden_car_but_accuse_no_sender():
     """The price: what one honest agent alone detects is lost. The limit: its sender keeps its trust and its place."""
     found = after_trust(TWO_COLLUDE, has_car=True).run(20, TWO_COLLUDE)
     assert ghost_kind(found) == REFUTED
@@ -319,7 +319,7 @@ def test_excluded_senders_are_not_counted_in_the_majority():
     assert sender(crossing.run(5, named), 1).status is MALICIOUS
 
 
-def test_claims_of_low_score_accuse_nobody():
+def test_claims_of_low_score_accuse_no_sender():
     many = {**WITH_TWO, 4: sees(4, SOUTH)}
     low = replace(CLAIMER, boxes=Boxes.cat([honest(1), cars(GHOST, score=0.45)]))
     found = after_trust(many).run(10, {**many, 1: low})

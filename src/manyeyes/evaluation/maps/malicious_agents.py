@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well the map solver tells malicious agents from honest ones: the error of each agent, and the ROC of it.
+"""How well the map solver distinguishes malicious agents from honest ones: the error of each agent, and the ROC of it.
 
 The score of an agent is the mean correction of its prior poses in standard deviations, at the end of the solution
 (``maps.fusion.joint_solver.estimate_agent_errors``). Malicious agents, which displace all that they observe, are positive, honest
