@@ -17,7 +17,7 @@ pytestmark = pytest.mark.training
 
 def test_one_frame_can_be_overfitted(toy, tmp_path):
     recording = toy(agents_n=2, scenarios=("toy_0",), frames=1, ground_points=100)
-    schedule = {"steps": 160, "batch": 1, "learning_rate": 8e-3, "warmup_steps": 10, "ema_decay": 0.9}
+    schedule = {"steps": 200, "batch": 1, "learning_rate": 6e-3, "warmup_steps": 10, "ema_decay": 0.9}
     config = DetectorTrainConfig(COSTR_TINY, augment=AugmentConfig.none(), **schedule)
     run = Trainer(DetectorTask(config, recording), tmp_path)
     losses = [run.advance() for _ in range(config.steps)]

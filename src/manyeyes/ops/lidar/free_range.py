@@ -45,7 +45,7 @@ def find_free(sight: Sight, boxes: F64x2, margin_m: F64x1) -> NDArray[np.bool_]:
 def measure_sight_reference(points: Tensor, sensor_height_m: float) -> Sight:
     """Do the same with every ray at every step of its part of a sector."""
     step, first_m, bottom, top, max_obstacle, behind = _LIMITS
-    num_columns, edges = NUM_SECTORS * NUM_PARTS, torch.arange(256).double() * step
+    num_columns, edges = NUM_SECTORS * NUM_PARTS, torch.arange(256, device="cpu").double() * step
     xyz = points.double()
     length, drop = xyz[:, :2].norm(dim=1), sensor_height_m - xyz[:, 2]
     free_m = length * (1 - behind / torch.hypot(length, drop)).clamp_min(0)
@@ -68,8 +68,8 @@ def measure_sight_reference(points: Tensor, sensor_height_m: float) -> Sight:
 
 def find_free_reference(sight: Sight, boxes: Tensor, margin_m: Tensor, num_samples: int = 60) -> Tensor:
     """Do the same with a grid of points (num_samples, num_samples) on each footprint."""
-    free = torch.zeros(len(boxes), dtype=torch.bool)
-    unit = torch.linspace(-1, 1, num_samples).double()
+    free = torch.zeros(len(boxes), dtype=torch.bool, device="cpu")
+    unit = torch.linspace(-1, 1, num_samples, device="cpu").double()
     for row, (box, margin) in enumerate(zip(boxes.double(), margin_m.tolist())):
         a, b = torch.meshgrid(unit * (box[3] / 2 + margin), unit * (box[4] / 2 + margin), indexing="ij")
         cosine, sine = box[6].cos(), box[6].sin()
