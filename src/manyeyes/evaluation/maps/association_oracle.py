@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Oracles that know which true element every observed one shows: maps at the prior poses, and at jointly estimated ones.
 
-The joint estimate is what a method could reach at best whose associations are all right: least squares over the poses of all
+The joint estimate is a reference for methods whose associations may be wrong, not a bound: least squares over the poses of all
 observations and an offset of each true station across its line, from every observed metre. Priors are those of the crowd: half of
 the variance of a pose, by default, is one error of the whole drive. Observed lines are bent, so that the points of one are not
 independent: their variance grows with their number. Rows and drives have Geman-McClure weights, for wrong poses and displaced
@@ -53,7 +53,7 @@ def fuse_with_true_association(experiment: FleetExperiment, poses: Floats | None
     """Return every observed true element, moved by the mean offset of its observations at poses (N, 3), by default the priors."""
     truth = experiment.place.truth
     points_by_element: dict[int, list[Floats]] = {}
-    for k, row, origin in _iterate_associations(experiment):
+    for k, row, origin in _list_associations(experiment):
         observation = experiment.observations[k]
         line = observation.elements.polyline(row)
         true = _move(line, experiment.fleet.true_poses[k])
@@ -106,7 +106,7 @@ def make_associated_rows(experiment: FleetExperiment) -> AssociatedRows:
     stations: dict[int, Floats] = {}
     num_stations = 0
     parts: list[tuple[Ints, Floats, Floats, Floats, Ints, Floats]] = []
-    for k, row, origin in _iterate_associations(experiment):
+    for k, row, origin in _list_associations(experiment):
         line, true_pose = experiment.observations[k].elements.polyline(row), experiment.fleet.true_poses[k]
         is_crossing = truth.kind[origin] == CROSSING
         if origin not in first_station:
@@ -133,7 +133,7 @@ def make_associated_rows(experiment: FleetExperiment) -> AssociatedRows:
     return AssociatedRows(observation, point, place, direction, station, variance)
 
 
-def _iterate_associations(experiment: FleetExperiment) -> list[tuple[int, int, int]]:
+def _list_associations(experiment: FleetExperiment) -> list[tuple[int, int, int]]:
     """List observation, row of its elements and row of the true element that it shows; false elements are left out."""
     offsets, found = experiment.fleet.origin_offsets, []
     for k in range(len(experiment.observations)):
