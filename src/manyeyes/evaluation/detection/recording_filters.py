@@ -12,55 +12,15 @@ from manyeyes.datasets.base import Recording
 from manyeyes.datatypes import ConfigError, GroundTruth, Snapshot, Transform
 
 
-@dataclass(frozen=True)
-class FrameStride:
-    """Every K-th evaluated frame of each scenario, the first one always; all frames can still be replayed."""
+class RecordingView:
+    """What is read of another recording as it is; views change a part. recording: the other one."""
 
     recording: Recording
-    stride: int
-
-    def __post_init__(self) -> None:
-        if self.stride < 1:
-            raise ConfigError(f"Every K-th frame is evaluated, K at least 1; got {self.stride}.")
 
     @property
     def scenarios(self) -> tuple[str, ...]:
         """As in the recording."""
         return self.recording.scenarios
-
-    def length(self, scenario: str) -> int:
-        """As in the recording."""
-        return self.recording.length(scenario)
-
-    def eval_indices(self, scenario: str) -> range:
-        """Return the indices K apart; the range ends behind the last of them, so that no further frame is replayed."""
-        indices = self.recording.eval_indices(scenario)[:: self.stride]
-        return range(indices.start, indices[-1] + 1, indices.step) if indices else indices
-
-    def agents(self, scenario: str) -> tuple[int, ...]:
-        """As in the recording."""
-        return self.recording.agents(scenario)
-
-    def snapshot(self, scenario: str, index: int) -> Snapshot:
-        """As in the recording."""
-        return self.recording.snapshot(scenario, index)
-
-
-@dataclass(frozen=True)
-class ScenarioStride:
-    """Every K-th scenario of a recording, the first one always."""
-
-    recording: Recording
-    stride: int
-
-    def __post_init__(self) -> None:
-        if self.stride < 1:
-            raise ConfigError(f"Every K-th scenario is evaluated, K at least 1; got {self.stride}.")
-
-    @property
-    def scenarios(self) -> tuple[str, ...]:
-        """Those K apart, in the recording's order."""
-        return self.recording.scenarios[:: self.stride]
 
     def length(self, scenario: str) -> int:
         """As in the recording."""
@@ -79,36 +39,53 @@ class ScenarioStride:
         return self.recording.snapshot(scenario, index)
 
 
-class CachedRecording:
-    """The last so many snapshots that were asked for are kept, for several who play a recording side by side."""
+@dataclass(frozen=True)
+class FrameStride(RecordingView):
+    """Every K-th evaluated frame of each scenario, the first one always; all frames can still be replayed."""
 
-    def __init__(self, recording: Recording, max_snapshots: int) -> None:
-        self._recording = recording
-        self._read = lru_cache(maxsize=max_snapshots)(recording.snapshot)
+    recording: Recording
+    stride: int
+
+    def __post_init__(self) -> None:
+        if self.stride < 1:
+            raise ConfigError(f"Every K-th frame is evaluated, K at least 1; got {self.stride}.")
+
+    def eval_indices(self, scenario: str) -> range:
+        """Return the indices K apart; the range ends behind the last of them, so that no further frame is replayed."""
+        indices = self.recording.eval_indices(scenario)[:: self.stride]
+        return range(indices.start, indices[-1] + 1, indices.step) if indices else indices
+
+
+@dataclass(frozen=True)
+class ScenarioStride(RecordingView):
+    """Every K-th scenario of a recording, the first one always."""
+
+    recording: Recording
+    stride: int
+
+    def __post_init__(self) -> None:
+        if self.stride < 1:
+            raise ConfigError(f"Every K-th scenario is evaluated, K at least 1; got {self.stride}.")
 
     @property
     def scenarios(self) -> tuple[str, ...]:
-        """As in the recording."""
-        return self._recording.scenarios
+        """Those K apart, in the recording's order."""
+        return self.recording.scenarios[:: self.stride]
 
-    def length(self, scenario: str) -> int:
-        """As in the recording."""
-        return self._recording.length(scenario)
 
-    def eval_indices(self, scenario: str) -> range:
-        """As in the recording."""
-        return self._recording.eval_indices(scenario)
+class CachedRecording(RecordingView):
+    """The last so many snapshots that were asked for are kept, for several who play a recording side by side."""
 
-    def agents(self, scenario: str) -> tuple[int, ...]:
-        """As in the recording."""
-        return self._recording.agents(scenario)
+    def __init__(self, recording: Recording, max_snapshots: int) -> None:
+        self.recording = recording
+        self._read = lru_cache(maxsize=max_snapshots)(recording.snapshot)
 
     def snapshot(self, scenario: str, index: int) -> Snapshot:
         """As in the recording, and the same object while it is kept."""
         return self._read(scenario, index)
 
 
-class NearestAgents:
+class NearestAgents(RecordingView):
     """The ego and the agents that are truly nearest to it when a scenario's first evaluated frame comes, ``num_agents`` in all.
 
     Scenarios that have fewer are left out. The choice holds for the whole scenario, so that the set of agents
@@ -119,29 +96,21 @@ class NearestAgents:
     def __init__(self, recording: Recording, num_agents: int) -> None:
         if num_agents < 1:
             raise ConfigError(f"num_agents is at least 1; got {num_agents}.")
-        self._recording, self._num_agents = recording, num_agents
+        self.recording, self._num_agents = recording, num_agents
         self._chosen: dict[str, frozenset[int]] = {}
 
     @property
     def scenarios(self) -> tuple[str, ...]:
         """Those with agents enough."""
-        return tuple(s for s in self._recording.scenarios if len(self._recording.agents(s)) >= self._num_agents)
-
-    def length(self, scenario: str) -> int:
-        """As in the recording."""
-        return self._recording.length(scenario)
-
-    def eval_indices(self, scenario: str) -> range:
-        """As in the recording."""
-        return self._recording.eval_indices(scenario)
+        return tuple(s for s in self.recording.scenarios if len(self.recording.agents(s)) >= self._num_agents)
 
     def agents(self, scenario: str) -> tuple[int, ...]:
         """Return the ids of those that are left, in their order."""
-        return tuple(agent for agent in self._recording.agents(scenario) if agent in self._select_nearest(scenario))
+        return tuple(agent for agent in self.recording.agents(scenario) if agent in self._select_nearest(scenario))
 
     def snapshot(self, scenario: str, index: int) -> Snapshot:
         """Return the frames of those that are left."""
-        full, selected = self._recording.snapshot(scenario, index), self._select_nearest(scenario)
+        full, selected = self.recording.snapshot(scenario, index), self._select_nearest(scenario)
         kept_rows = [row for row, frame in enumerate(full.frames) if frame.agent_id in selected]
         removed_rows = [row for row in range(len(full.frames)) if row not in kept_rows]
         return replace(
@@ -152,7 +121,7 @@ class NearestAgents:
 
     def _select_nearest(self, scenario: str) -> frozenset[int]:
         if scenario not in self._chosen:
-            first = self._recording.snapshot(scenario, self._recording.eval_indices(scenario).start)
+            first = self.recording.snapshot(scenario, self.recording.eval_indices(scenario).start)
             poses = (
                 first.truth.world_from_agent
                 if first.truth
