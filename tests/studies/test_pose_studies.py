@@ -9,11 +9,13 @@ from types import SimpleNamespace
 import pytest
 import torch
 from PIL import Image
+from tests.studies.engine.test_conditions import make_result
 
 from manyeyes.agents.perception_cache import PerceptionCache
 from manyeyes.cli import main as cli
 from manyeyes.datasets.opv2v import Opv2vWriter
 from manyeyes.datatypes import AgentFrame, Boxes, GroundTruth, PointCloud, Snapshot, Transform
+from manyeyes.evaluation.detection.protocols import PROTOCOLS
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
@@ -21,6 +23,7 @@ from manyeyes.models.pose.box_descriptors import BoxKeypointConfig
 from manyeyes.models.pose.feakm import FORMAT, FeakmConfig, FeakmNet
 from manyeyes.models.pose.matcher import MatcherConfig
 from manyeyes.studies.detection.perturbations import Perturbation
+from manyeyes.studies.engine.conditions import ResultGrid
 from manyeyes.studies.pose import feakm, pose_estimation as pose_accuracy, pose_noise_ap as pose
 
 PLACES = torch.tensor(
@@ -100,6 +103,29 @@ def test_every_corrector_with_every_fusion_under_the_requested_levels(data, tmp_
     )
     assert {c["metric"] for c in held["comparisons"]} == {"AP@0.5"} and len(descriptions) == 4
     assert {name: len(at5) for name, at5, _ in held["paper"]["rows"]}["FeaKM, 4 pairs"] == 11
+
+
+def test_the_default_corrector_is_compared_with_each_other_one_by_common_objects() -> None:
+    """Voting finds one vehicle more than mash where two objects are common, and three more where nine are."""
+    levels = (pose.CLEAN, Perturbation(position_sigma_m=0.8), pose.LEVELS[4], pose.LEVELS[-1])
+    found = {"identity": (2, 2), "voting": (2, 4), "mash": (1, 1)}
+    results = {
+        (pose.condition_name(name, level), "intermediate"): make_result("intermediate", hits)
+        for name, hits in found.items()
+        for level in levels
+    }
+    grid, common = ResultGrid(results, PROTOCOLS["global-sort"]), {("s0", 0): 2, ("s1", 0): 9}
+    comparisons = pose.make_comparisons(grid, tuple(found), common)
+    gains = {c.description: c.interval.value for c in comparisons if c.description.startswith("voting - mash, ")}
+    buckets = "0 to 3 in common", "8 and more in common"
+    assert list(gains) == [
+        f"voting - mash, {name}"
+        for level in ("clean", "2°, 2 m")
+        for name in (level, *(f"{level}, {bucket}" for bucket in buckets))
+    ] + ["voting - mash, 0.8 m"]
+    assert gains["voting - mash, 2°, 2 m, 0 to 3 in common"] == pytest.approx(1 / 4)
+    assert gains["voting - mash, 2°, 2 m, 8 and more in common"] == pytest.approx(3 / 4)
+    assert not any("voting - identity" in c.description for c in comparisons)
 
 
 def test_the_levels_are_feakms_columns() -> None:

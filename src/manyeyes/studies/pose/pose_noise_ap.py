@@ -205,14 +205,20 @@ def _bootstrap(results: ResultGrid, key: ResultKey, bucket: tuple[int, int], com
 
 
 def make_comparisons(results: ResultGrid, names: Sequence[str], common: CommonObjects) -> tuple[Comparison, ...]:
-    """Compare each corrector before the project's own fusion with true poses and with no fusion of the same form."""
+    """Compare each corrector before the project's own fusion with true poses and with no fusion of the same form; and the default
+    corrector with each other one.
+    """
     evaluated = [OURS + form for form in FORMS if (condition_name(IDENTITY, CLEAN), OURS + form) in results.results]
+    correctors = [name for name in names if name != IDENTITY]
+    others = [name for name in correctors if name != DEFAULT_CORRECTOR] if DEFAULT_CORRECTOR in names else []
     return tuple(
         c
         for ours in evaluated
-        for name in names
-        if name != IDENTITY
-        for c in _compare_corrector(results, name, ours, common)
+        for part in (
+            *(_compare_corrector(results, name, ours, common) for name in correctors),
+            *(_compare_with_default(results, name, ours, common) for name in others),
+        )
+        for c in part
     )
 
 
@@ -240,6 +246,20 @@ def _compare_corrector(results: ResultGrid, name: str, ours: str, common: Common
             worst = min(gains, key=lambda level: gains[level].value)
             description = f"{stem}, worst level ({worst.name}), {which}: corrected - no fusion"
             yield Comparison(description, "AP@0.5", gains[worst])
+
+
+def _compare_with_default(results: ResultGrid, name: str, ours: str, common: CommonObjects) -> Iterator[Comparison]:
+    """Compare the default corrector with another: at single errors, and without and with the largest error by common objects."""
+    stem = f"{DEFAULT_CORRECTOR}{form_of(ours)} - {Path(name).stem}{form_of(ours)}"
+    for level in _select_evaluated(results, name, ours):
+        key, other = (condition_name(DEFAULT_CORRECTOR, level), ours), (condition_name(name, level), ours)
+        if level in (CLEAN, *SINGLE_ERROR_LEVELS, LEVELS[-1]):
+            yield results.compare(f"{stem}, {level.name}", key, other)
+        for bucket in COMMON_OBJECT_RANGES if level in (CLEAN, LEVELS[-1]) else ():
+            samples = _bootstrap(results, key, bucket, common)
+            if samples.names:
+                difference = samples.paired_difference(_bootstrap(results, other, bucket, common))
+                yield Comparison(f"{stem}, {level.name}, {_format_range(bucket)} in common", "AP@0.5", difference)
 
 
 def _format_range(bucket: tuple[int, int]) -> str:
