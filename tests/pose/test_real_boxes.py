@@ -90,6 +90,18 @@ def test_vehicles_beside_and_ahead_are_not_taken_for_clutter(placement: str) -> 
         assert found.pose is not None and error_m(found.pose, truth) < 1.0
 
 
+@pytest.mark.parametrize("scene", [113, 1451])
+def test_common_objects_far_behind_both_vehicles_are_not_taken_for_clutter(scene: int) -> None:
+    """A turn of two to three degrees cancels the shift of five objects, which coincide in both frames."""
+    made = make_landmark_scene(LandmarkSpec(8, 18, 24, REAL_BOXES, placement="beside"), 101, scene)
+    ego, other = Landmarks.of_boxes(made.ego[0]), Landmarks.of_boxes(made.other[0])
+    found = find_sensor_fixed(ego, other, IdentityFilter(max_variance_ratio=math.inf))
+    assert found is not None and found[0].sum() == 5
+    assert find_sensor_fixed(ego, other, IdentityFilter()) is None
+    pose = CORRECT(ego, other, None).pose
+    assert pose is not None and error_m(pose, made.ego_from_other) < 1.0
+
+
 def test_identical_frames_are_matched_with_a_prior_and_not_without() -> None:
     ego, _, _ = observe(LandmarkSpec(8, 8, 8), 2)
     assert CORRECT(ego, ego, None).status is PoseStatus.NO_MATCH

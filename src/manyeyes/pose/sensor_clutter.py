@@ -2,7 +2,9 @@
 """False boxes that are fixed to the sensors: they coincide where the frames of two agents coincide, whatever the true pose.
 
 Such boxes agree at the identity pose, and hundreds of them outweigh a prior and all true objects. They are found by the number of
-pairs that coincide in both agents' frames, against the numbers at shifted frames, which count chance and traffic.
+pairs that coincide in both agents' frames, against the numbers at shifted frames, which count chance and traffic. Common objects of
+vehicles beside each other can coincide too, far behind both, where a small turn cancels the shift. They are kept: they agree far
+better at another pose than at the identity.
 """
 
 from __future__ import annotations
@@ -11,9 +13,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from manyeyes.datatypes import ConfigError
+from manyeyes.ops.rigid import fit_se2
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.types import PosePrior, wrap_angle
 
@@ -26,8 +30,10 @@ class IdentityFilter:
     """When to remove landmarks that coincide in both agents' own frames.
 
     max_distance_m, max_turn_rad, max_size_difference_m: of two landmarks that coincide. min_pairs: pairs that are needed at least.
-    excess_sigmas: by which they exceed the mean number at shifted frames. pose_m, pose_rad: a pose with a smaller translation and
-    turn is the identity. prior_sigmas: standard deviations within which a prior counts as near the identity.
+    excess_sigmas: by which they exceed the mean number at shifted frames. max_variance_ratio: variance that the best other pose of
+    such pairs explains, over the one it leaves, up to which they are fixed to the sensors (an F ratio of three and 2 n - 3 degrees
+    of freedom). pose_m, pose_rad: a pose with a smaller translation and turn is the identity. prior_sigmas: standard deviations
+    within which a prior counts as near the identity.
     """
 
     max_distance_m: float = 1.5
@@ -35,6 +41,7 @@ class IdentityFilter:
     max_size_difference_m: float = 1.0
     min_pairs: int = 5
     excess_sigmas: float = 4.0
+    max_variance_ratio: float = 7.0
     pose_m: float = 1.5
     pose_rad: float = math.radians(5.0)
     prior_sigmas: float = 2.0
@@ -93,6 +100,19 @@ def find_sensor_fixed(a: Landmarks, b: Landmarks, settings: IdentityFilter) -> t
     chance = float(np.mean([(np.square(offset - shift).sum(1) < limit).sum() for shift in _SHIFTS]))
     if coincide.sum() < chance + settings.excess_sigmas * math.sqrt(chance + 1.0):
         return None
+    if _agree_elsewhere(a.xy[rows[coincide]], b.xy[columns[coincide]], settings):
+        return None
     fixed_a, fixed_b = np.zeros(len(a), bool), np.zeros(len(b), bool)
     fixed_a[rows[coincide]] = fixed_b[columns[coincide]] = True
     return fixed_a, fixed_b
+
+
+def _agree_elsewhere(a: Floats, b: Floats, settings: IdentityFilter) -> bool:
+    """Return whether points (N, 2) that coincide agree far better at another pose than the identity."""
+    pose = fit_se2(torch.from_numpy(b), torch.from_numpy(a)).numpy()
+    if settings.is_identity(pose[None])[0]:
+        return False
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    left = float(np.square(a - b @ np.array([[cos, sin], [-sin, cos]]) - pose[:2]).sum())
+    explained, dof = float(np.square(a - b).sum()) - left, 2 * len(a) - 3
+    return explained / 3 > settings.max_variance_ratio * left / dof
