@@ -38,5 +38,5 @@ for name, elements in (("fused", made.elements), ("union", union)):
         f"recall {divider.recall:.2f}, duplication {quality.get_kind('divider').duplication:.2f}"
     )
 
-save_map_page(make_page("Crossroads", made, truth, union, len(observations)), page)
+save_map_page(make_page("Crossroads", made, truth, observations), page)
 print(f"wrote {page}")

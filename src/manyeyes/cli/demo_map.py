@@ -60,16 +60,14 @@ def map_crossing(out: Path, seed: int = 0) -> tuple[DemoMapStats, Chapter]:
     )
     MapFolder(out).write(experiment)
     write_vector_map(fused, out / "map")
-    observed = MapElements.cat([o.elements_in_map() for o in experiment.observations])
-    page = make_page(
-        "One map from many drives", fused, experiment.truth, observed, len(experiment.observations), evaluated
-    )
+    page = make_page("One map from many drives", fused, experiment.truth, experiment.observations, evaluated)
     save_map_page(page, out / "map.html")
     save_figure(
         _make_pair_panels(experiment, solve_poses(experiment.observations, settings.config_of(OURS).pose_solver)),
         out / "misalignment.png",
     )
     area = experiment.place.area
+    observed = MapElements.cat([o.elements_in_map() for o in experiment.observations])
     panels = [
         MapPanel(f"{len(experiment.observations)} observations", observed, experiment.truth, area=area),
         MapPanel("Fused map, truth behind it", evaluated, experiment.truth, area=area),

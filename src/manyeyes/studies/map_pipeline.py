@@ -227,7 +227,7 @@ def write_built_map(built: BuiltMap, out: Path, title: str) -> None:
     if built.truth is not None and town_map.cut_policy is not None:
         folder.write_truth(built.truth, town_map.frame, town_map.cut_policy)
     write_vector_map(built.fused, out / "map")
-    page = make_page(title, built.fused, built.truth, built.observed, len(observations), built.evaluated)
+    page = make_page(title, built.fused, built.truth, observations, built.evaluated)
     save_map_page(page, out / "map.html")
     area = _bounding_area(built.observed, built.truth)
     panels = [

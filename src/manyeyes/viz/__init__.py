@@ -16,7 +16,13 @@ if TYPE_CHECKING:
         save_png as save_png,
     )
     from manyeyes.viz.map_figures import MapPanel as MapPanel, save_figure as save_figure
-    from manyeyes.viz.map_page import MapPage as MapPage, make_page as make_page, save_map_page as save_map_page
+    from manyeyes.viz.map_page import (
+        Basemap as Basemap,
+        MapPage as MapPage,
+        ObservedElements as ObservedElements,
+        make_page as make_page,
+        save_map_page as save_map_page,
+    )
     from manyeyes.viz.report import Chapter as Chapter, HtmlReport as HtmlReport, save_report as save_report
 
 __getattr__, __dir__ = attach(__name__)

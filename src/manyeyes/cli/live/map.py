@@ -99,7 +99,6 @@ def _receive(subscriber: MapSubscriber, seconds: float | None) -> None:
 
 def _write(subscriber: MapSubscriber, out: Path) -> str:
     """Write the folder of the map, and describe it in one line."""
-    from manyeyes.datatypes.map_element import MapElements
     from manyeyes.studies.map_folder import MapFolder, write_vector_map
     from manyeyes.viz.map_page import make_page, save_map_page
 
@@ -108,8 +107,7 @@ def _write(subscriber: MapSubscriber, out: Path) -> str:
     fused = server.rebuild() if observations else server.map()
     MapFolder(out).write_observations(observations, server.frame)
     write_vector_map(fused, out / "map")
-    observed = MapElements.cat([one.elements_in_map() for one in observations]) if observations else None
-    save_map_page(make_page("A map of live agents", fused, None, observed, len(observations)), out / "map.html")
+    save_map_page(make_page("A map of live agents", fused, observations=observations), out / "map.html")
     agents, dropped = len({one.agent for one in observations}), subscriber.dropped
     # Packets of tokens are of no use to a map.
     counts = {name: count for name, count in vars(dropped).items() if count and name != "wrong_model"}

@@ -24,23 +24,27 @@ class Options:
     out: OutputFile | None = None
     """The page (.html) or picture (.png); map.html in the map's folder by default, of a store at a URL in out/map/NAME."""
     max_observations: PositiveInt = 500
-    """Draw at most so many observations, which bounds the size of the page."""
+    """Draw at most so many observations, the earliest ones, which bounds the size of the page."""
+    basemap: str | None = None
+    """URL of tiles behind the map, with {z}, {x} and {y}: the page then fetches them from there. By default it fetches nothing."""
+    basemap_credit: str = ""
+    """Whose tiles these are, shown on the page."""
 
 
 def main(options: Options) -> None:
     """Draw a map as a page or an image."""
     from rich.console import Console
 
-    from manyeyes.datatypes.map_element import MapElements
     from manyeyes.maps.store.map_place import MapPlace
     from manyeyes.studies.map_folder import MapFolder, load_observations, read_vector_map
     from manyeyes.viz.map_figures import MapPanel, save_figure
-    from manyeyes.viz.map_page import make_page, save_map_page
+    from manyeyes.viz.map_page import Basemap, make_page, save_map_page
 
     place = MapPlace.parse(options.folder)
     out = options.out or place.output_folder / "map.html"
     if out.suffix.lower() not in (".html", ".png"):
         raise ConfigError(f"--out ends in .html or .png; got {out.name}.")
+    basemap = None if options.basemap is None else Basemap(options.basemap, options.basemap_credit)
     console = Console()
     vector_map = read_vector_map(options.folder)
     true_place = options.truth or place.beside("truth")
@@ -48,11 +52,6 @@ def main(options: Options) -> None:
     truth = None if true_place in (None, place) else read_vector_map(str(true_place)).elements
     observations_path = options.observations or place.beside("observations")
     observations = load_observations(observations_path, console).observations if observations_path else ()
-    observed = (
-        MapElements.cat([o.elements_in_map() for o in observations[: options.max_observations]])
-        if observations
-        else None
-    )
     title = place.name
     if out.suffix.lower() == ".png":
         save_figure([MapPanel(title, vector_map.select_published().elements, truth)], out, columns=1, width_in=10.0)
@@ -60,5 +59,6 @@ def main(options: Options) -> None:
         true_folder = None if true_place is None or truth is None else true_place.folder
         cut_policy = None if true_folder is None else MapFolder(true_folder.parent).read_cut_policy()
         evaluated = cut_policy(vector_map.select_published().elements) if cut_policy else None
-        save_map_page(make_page(title, vector_map, truth, observed, len(observations), evaluated), out)
+        page = make_page(title, vector_map, truth, observations, evaluated, options.max_observations, basemap)
+        save_map_page(page, out)
     console.print(f"{out}: {len(vector_map.select_published())} published elements", highlight=False, soft_wrap=True)
