@@ -95,11 +95,24 @@ def test_common_objects_far_behind_both_vehicles_are_not_taken_for_clutter(scene
     """A turn of two to three degrees cancels the shift of five objects, which coincide in both frames."""
     made = make_landmark_scene(LandmarkSpec(8, 18, 24, REAL_BOXES, placement="beside"), 101, scene)
     ego, other = Landmarks.of_boxes(made.ego[0]), Landmarks.of_boxes(made.other[0])
-    found = find_sensor_fixed(ego, other, IdentityFilter(max_variance_ratio=math.inf))
+    found = find_sensor_fixed(ego, other, IdentityFilter(max_variance_ratio=math.inf, min_removed=5))
     assert found is not None and found[0].sum() == 5
     assert find_sensor_fixed(ego, other, IdentityFilter()) is None
     pose = CORRECT(ego, other, None).pose
     assert pose is not None and error_m(pose, made.ego_from_other) < 1.0
+
+
+def test_few_boxes_that_coincide_forbid_the_identity_and_are_kept() -> None:
+    spec = LandmarkSpec(8, 7, 7, REAL_BOXES, clutter=SensorClutter(5))
+    ego, other, truth = observe(spec, 0)
+    fixed = find_sensor_fixed(ego, other, IdentityFilter())
+    assert fixed is not None and not fixed[0].any() and not fixed[1].any()
+    assert not any(
+        IdentityFilter().is_identity(one.pose[None])[0]
+        for one in find_candidates(ego, other, DETECTOR_BOXES_CONFIG.vote)
+    )
+    pose = CORRECT(ego, other, None).pose
+    assert pose is not None and error_m(pose, truth) < 1.0
 
 
 def test_identical_frames_are_matched_with_a_prior_and_not_without() -> None:

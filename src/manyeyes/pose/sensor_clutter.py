@@ -27,9 +27,10 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class IdentityFilter:
-    """When to remove landmarks that coincide in both agents' own frames.
+    """When landmarks that coincide in both agents' own frames are fixed to the sensors: the identity is then no pose of the agents.
 
     max_distance_m, max_turn_rad, max_size_difference_m: of two landmarks that coincide. min_pairs: pairs that are needed at least.
+    min_removed: from so many pairs on, their landmarks are removed; fewer, which may be common objects, do not hide the true pose.
     excess_sigmas: by which they exceed the mean number at shifted frames. max_variance_ratio: variance that the best other pose of
     such pairs explains, over the one it leaves, up to which they are fixed to the sensors (an F ratio of three and 2 n - 3 degrees
     of freedom). pose_m, pose_rad: a pose with a smaller translation and turn is the identity. prior_sigmas: standard deviations
@@ -40,6 +41,7 @@ class IdentityFilter:
     max_turn_rad: float = 0.15
     max_size_difference_m: float = 1.0
     min_pairs: int = 5
+    min_removed: int = 8
     excess_sigmas: float = 4.0
     max_variance_ratio: float = 7.0
     pose_m: float = 1.5
@@ -80,7 +82,7 @@ _SHIFTS = np.array(
 
 
 def find_sensor_fixed(a: Landmarks, b: Landmarks, settings: IdentityFilter) -> tuple[Bools, Bools] | None:
-    """Return which landmarks (N,) of a and (M,) of b are fixed to the sensors; None where there are too few to tell."""
+    """Return which landmarks (N,) of a and (M,) of b are removed; None where none seem fixed to the sensors."""
     dx, dy = (a.xy[:, axis, None] - b.xy[None, :, axis] for axis in (0, 1))
     reach = max(_RADII_M) + settings.max_distance_m
     rows, columns = np.nonzero(dx * dx + dy * dy < reach * reach)
@@ -103,7 +105,8 @@ def find_sensor_fixed(a: Landmarks, b: Landmarks, settings: IdentityFilter) -> t
     if _agree_elsewhere(a.xy[rows[coincide]], b.xy[columns[coincide]], settings):
         return None
     fixed_a, fixed_b = np.zeros(len(a), bool), np.zeros(len(b), bool)
-    fixed_a[rows[coincide]] = fixed_b[columns[coincide]] = True
+    if coincide.sum() >= settings.min_removed:
+        fixed_a[rows[coincide]] = fixed_b[columns[coincide]] = True
     return fixed_a, fixed_b
 
 
