@@ -45,8 +45,12 @@ class Options:
     """Which scenario; the first by default."""
     frames: PositiveInt | None = None
     """At most so many instants."""
+    start: str | None = None
+    """When the drive begins: a time of today such as 18:05:00, or a date and time, local if it states no zone. Agents with one
+    start play one scene together; a late one joins in the middle. By default each begins at once."""
     rate: PlaybackRate = 1.0
-    """Speed of the clock; below 1 everything is slow, deadlines too, for machines that several agents share."""
+    """Speed of the clock; below 1 everything is slow, deadlines too, for machines that several agents share: give them one
+    --start."""
     perceive_after_ms: DurationMs = 70.0
     """How long after the sweep the agent waits for messages; it perceives earlier where all are complete."""
     deadline_ms: DurationMs = 100.0
@@ -77,18 +81,20 @@ def main(options: Options) -> None:
     from rich.console import Console
 
     from manyeyes.cli.live.options import make_agent
+    from manyeyes.cli.live.start import parse_start
     from manyeyes.cli.live.table import print_summaries, save_summary
     from manyeyes.models import pretrained
     from manyeyes.runtime.live import LiveConfig, LiveRun
     from manyeyes.runtime.recorder import Recorder
 
     torch.set_num_threads(options.threads)
+    start_ns = None if options.start is None else parse_start(options.start)
     security = options.security.load(options.agent)
     first, start_frames = _open_frames(options)
     config = options.method.describe(pretrained.load(options.method.weights).fingerprint, security.mode)
     deadlines = LiveConfig(round(options.perceive_after_ms * 1e6), round(options.deadline_ms * 1e6))
     agent = make_agent(config)
-    clock = _wait_for_start(options, config, first)
+    clock = _wait_for_start(options, config, first, start_ns)
     frames = start_frames(clock)
     network = options.network.open(options.agent, clock.now_ns)
     try:
@@ -142,7 +148,7 @@ def _open_source(options: Options, source: str) -> tuple[AgentFrame, Callable[[L
     return first, start
 
 
-def _wait_for_start(options: Options, config: RunConfig, first: AgentFrame) -> LiveClock:
+def _wait_for_start(options: Options, config: RunConfig, first: AgentFrame, start_ns: int | None) -> LiveClock:
     """Warm up with the first frame, and return the clock, whose start is when the others start too."""
     from manyeyes.cli.live.options import make_agent
     from manyeyes.cli.live.start import announce_ready
@@ -154,7 +160,7 @@ def _wait_for_start(options: Options, config: RunConfig, first: AgentFrame) -> L
         began = time.process_time()
         probe.perceive(frame, probe.share(frame))
         took = time.process_time() - began
-    return announce_ready(options.await_start, took, options.rate)
+    return announce_ready(options.await_start, took, options.rate, start_ns)
 
 
 def _collect(run: LiveRun, options: Options, clock: LiveClock) -> RunSummary:
