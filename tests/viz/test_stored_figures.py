@@ -80,6 +80,16 @@ RESULTS: dict[str, dict[str, Any]] = {
             for s in (0.0, 1.0)
         ]
     },
+    "ap-pose-noise": {
+        "rows": [
+            {
+                "corrector": corrector, "method": method, "ap": [interval(0.8), interval(0.6)],
+                "level": perturbation(heading_sigma_deg=s, position_sigma_m=s),
+            }
+            for corrector, method in (("voting", "intermediate"), ("identity", "F-Cooper"))
+            for s in (0.0, 2.0)
+        ]
+    },
     "map-observations": {
         "summaries": [{"group": f"{n} observations", "method": "union", "mean_ap": interval(0.4)} for n in (20, 60)]
     },
@@ -134,6 +144,7 @@ def test_a_figure_names_axes_methods_and_units() -> None:
     assert {"log2(bytes per message)", "AP@0.5", "AP@0.7", "no-fusion", "late", "early"} <= set(shown_texts("ap-bytes"))
     assert {"delay [s]", "heading error [°]", "position error [m]"} <= set(shown_texts("robustness"))
     assert {"early - late", "AP@0.7"} <= set(shown_texts("differences"))
+    assert {"intermediate, voting", "F-Cooper, identity", "AP@0.7"} <= set(shown_texts("ap-pose-noise"))
 
 
 def test_forms_of_a_method_have_labels_of_their_own() -> None:

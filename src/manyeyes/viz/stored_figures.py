@@ -228,6 +228,29 @@ def _make_pose_noise(results: Sequence[StoredResult]) -> list[Panel]:
     ]
 
 
+def _make_ap_pose_noise(results: Sequence[StoredResult]) -> list[Panel]:
+    rows = [row for stored in results for row in stored.result["rows"]]
+    shown = [
+        row
+        for row in rows
+        if row["method"] != "no-fusion" and row["level"]["position_sigma_m"] == row["level"]["heading_sigma_deg"]
+    ]
+    fusions = list(dict.fromkeys((row["method"], row["corrector"]) for row in shown))
+    is_single = len({row["method"] for row in shown}) == 1
+
+    def make_panel(iou: int) -> Panel:
+        def draw(axes: Any, theme: Theme) -> None:
+            for place, (method, corrector) in enumerate(fusions):
+                mine = [row for row in shown if (row["method"], row["corrector"]) == (method, corrector)]
+                x = [row["level"]["position_sigma_m"] for row in mine]
+                label = corrector if is_single else f"{method}, {corrector}"
+                draw_line(axes, x, [row["ap"][iou] for row in mine], theme, place, label)
+
+        return Panel("", "sigma of the prior pose [m and °]", _IOUS[iou], draw)
+
+    return [make_panel(iou) for iou in range(len(_IOUS))]
+
+
 def _make_reliability(results: Sequence[StoredResult]) -> list[Panel]:
     rows = [row for stored in results for row in stored.result["rows"]]
 
@@ -397,6 +420,12 @@ FIGURES = {
         "Pose correctors against the noise of the prior pose",
         "manyeyes study pose-estimation --data data/carla-towns-small --split val",
         _make_pose_noise,
+    ),
+    "ap-pose-noise": StoredFigure(
+        "AP against the noise of prior poses, by corrector and fusion",
+        "manyeyes study pose-noise-ap --data data/carla-towns-small --split test",
+        _make_ap_pose_noise,
+        height_in=4.6,
     ),
     "map-observations": StoredFigure(
         "mAP of fused maps against the number of observations", "manyeyes study fusion", _make_map_observations
