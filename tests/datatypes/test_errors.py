@@ -35,3 +35,4 @@ def test_worker_raises_missing_extra() -> None:
 def test_a_missing_extra_names_the_line_for_a_checkout_too() -> None:
     text = str(MissingExtraError("sim,view", "demo"))
     assert "pip install 'manyeyes[sim,view]'" in text and "in a checkout: pip install -e '.[sim,view]'" in text
+    assert "--find-links FOLDER" in text

@@ -48,7 +48,8 @@ class MissingExtraError(ManyeyesError, ImportError):
     def __init__(self, extra: str, purpose: str) -> None:
         names = " and ".join(f"'{name}'" for name in extra.split(","))
         noun = "extras" if "," in extra else "extra"
-        line = f"pip install 'manyeyes[{extra}]' (in a checkout: pip install -e '.[{extra}]')"
+        others = f"with a wheel in FOLDER: --find-links FOLDER; in a checkout: pip install -e '.[{extra}]'"
+        line = f"pip install 'manyeyes[{extra}]' ({others})"
         super().__init__(f"{purpose} needs the {names} {noun}: {line}")
         self._arguments = extra, purpose
 
