@@ -170,6 +170,19 @@ def test_loops_run_where_no_folder_can_be_written(monkeypatch: pytest.MonkeyPatc
     assert find_cache_folder() is None
 
 
+def test_a_loop_has_one_form_for_all_constants_of_a_type() -> None:
+    @njit()
+    def scale(x, factor, is_negative):  # pragma: no cover
+        return -factor * x if is_negative else factor * x
+
+    @njit()
+    def sum_scaled(x, factor):  # pragma: no cover
+        return scale(x, 2, False) + scale(x, 3, is_negative=True) + scale(x, factor, False)
+
+    assert sum_scaled(2.0, 5) == 8.0
+    assert len(scale._linked.overloads) == 1
+
+
 def test_loops_call_themselves_and_one_another() -> None:
     @njit()
     def factorial(n):  # pragma: no cover

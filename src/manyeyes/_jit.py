@@ -7,8 +7,8 @@ processes.
 
 numba makes machine code of every loop that another one calls, and optimises it again in each caller. Here a loop that a compiled
 one calls is only linked into it, and optimised there, and so is what numba itself has of numpy's functions, so that a fresh
-installation compiles in about half the time. A loop that Python calls is compiled and kept as numba does it. Every compiled loop of
-the package takes njit from here.
+installation compiles in about half the time. It has one form for all constants of a type that callers pass. A loop that Python
+calls is compiled and kept as numba does it. Every compiled loop of the package takes njit from here.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any, Literal, TypeVar, cast
 import numpy as np
 from filelock import FileLock
 from numba import jit
-from numba.core import caching
+from numba.core import caching, types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
@@ -152,7 +152,9 @@ class _CompiledLoop(CPUDispatcher):
             return super().compile(sig)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        return self._linked.get_call_template(args, kws)
+        """Find the form for a compiled caller's types; one for all constants of a type, where numba compiles one for each."""
+        general = tuple(map(types.unliteral, args)), {name: types.unliteral(kind) for name, kind in kws.items()}
+        return self._linked.get_call_template(*general)
 
     def get_overload(self, sig: Any) -> Any:
         return self._linked.get_overload(sig)
