@@ -8,6 +8,9 @@ BIN := $(VENV)/bin
 comma := ,
 STAMP := $(VENV)/.installed
 DEMO_STAMP := $(VENV)/.installed-demo
+COMPILED := $(VENV)/.compiled
+# The environment of the tests has all that the demo needs; without one, a smaller one is installed.
+DEMO_ENVIRONMENT := $(if $(wildcard $(STAMP)),$(STAMP),$(DEMO_STAMP))
 
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
@@ -42,6 +45,7 @@ help:
 	@echo "make clean         remove the environment, outputs and caches"
 
 venv: $(STAMP)
+	@$(MAKE) --no-print-directory $(COMPILED)
 
 define install
 	@$(PYTHON) -c 'import sys; sys.exit("manyeyes: the pinned environment needs Python 3.11 or later; say make PYTHON=python3.11" if sys.version_info < (3, 11) else 0)'
@@ -57,8 +61,13 @@ $(STAMP): pyproject.toml constraints.txt
 $(DEMO_STAMP): pyproject.toml constraints.txt
 	$(call install,sim$(comma)view)
 
-# The environment of the tests has all that the demo needs; without one, a smaller one is installed.
-demo: $(if $(wildcard $(STAMP)),$(STAMP),$(DEMO_STAMP))
+# The last step of the installation for the demo. The tests compile what each of them needs.
+$(COMPILED): $(DEMO_ENVIRONMENT)
+	@echo "Compiling the loops of the demo, in two processes."
+	@$(BIN)/manyeyes doctor --compile
+	@touch $@
+
+demo: $(COMPILED)
 	@$(BIN)/manyeyes demo --out $(OUT)
 
 test: $(STAMP)

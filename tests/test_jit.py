@@ -1,8 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled loops: two processes that compile variants of one at once keep both; what a loop calls is linked into it."""
+"""Compiled loops: two processes that compile variants of one at once keep both; what a loop calls is linked into it.
+
+Garbage is not collected meanwhile, and loops run where no folder can be written.
+"""
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import pickle
 import re
@@ -16,9 +20,18 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
+from numba.core import caching, event
 
 import manyeyes
-from manyeyes._jit import _LockedIndexFile, add_row, njit, set_row, set_rows
+from manyeyes._jit import (
+    _LinkedCompiler,
+    _LockedIndexFile,
+    add_row,
+    find_cache_folder,
+    njit,
+    set_row,
+    set_rows,
+)
 
 
 class _Slow(_LockedIndexFile):
@@ -100,6 +113,74 @@ def test_a_loop_called_by_loops_has_no_code_of_its_own_until_python_calls_it() -
     assert square(4.0) == 16.0 and len(square.overloads) == 1
     assert sum_squares(np.array([5.0])) == 25.0
     assert sum_squares(np.array([5.0], np.float32)) == 25.0
+
+
+class _Compilations(event.Listener):
+    """The compiler of each loop that is compiled, by its name, and whether garbage was collected meanwhile."""
+
+    def __init__(self) -> None:
+        self.compilers: dict[str, type] = {}
+        self.is_collecting: list[bool] = []
+
+    def on_start(self, event: event.Event) -> None:
+        dispatcher = event.data["dispatcher"]
+        self.compilers[dispatcher.py_func.__qualname__] = dispatcher._compiler.pipeline_class
+        self.is_collecting.append(gc.isenabled())
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+def test_functions_of_numpy_are_linked_too() -> None:
+    @njit()
+    def rotate(values, turns):  # pragma: no cover
+        return np.roll(values, turns)
+
+    with event.install_listener("numba:compile", _Compilations()) as found:
+        assert rotate(np.array([1.0, 2.0, 3.0]), 1).tolist() == [3.0, 1.0, 2.0]
+    inner = {compiler for name, compiler in found.compilers.items() if "rotate" not in name}
+    assert inner == {_LinkedCompiler}
+
+
+def test_garbage_is_not_collected_while_a_loop_is_compiled() -> None:
+    @njit()
+    def double(x):  # pragma: no cover
+        return 2 * x
+
+    with event.install_listener("numba:compile", _Compilations()) as found:
+        assert double(2.0) == 4.0
+        assert found.is_collecting == [False] and gc.isenabled()
+        gc.disable()
+        try:
+            assert double(2) == 4 and not gc.isenabled()
+        finally:
+            gc.enable()
+
+
+def test_loops_run_where_no_folder_can_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(caching.CompileResultCacheImpl, "_locator_classes", [])
+
+    @njit(cache=True)
+    def triple(x):  # pragma: no cover
+        return 3 * x
+
+    assert triple(2) == 6
+    assert find_cache_folder() is not None
+    monkeypatch.setattr(set_row, "_cache", triple._cache)
+    assert find_cache_folder() is None
+
+
+def test_a_loop_has_one_form_for_all_constants_of_a_type() -> None:
+    @njit()
+    def scale(x, factor, is_negative):  # pragma: no cover
+        return -factor * x if is_negative else factor * x
+
+    @njit()
+    def sum_scaled(x, factor):  # pragma: no cover
+        return scale(x, 2, False) + scale(x, 3, is_negative=True) + scale(x, factor, False)
+
+    assert sum_scaled(2.0, 5) == 8.0
+    assert len(scale._linked.overloads) == 1
 
 
 def test_loops_call_themselves_and_one_another() -> None:

@@ -6,24 +6,31 @@ for both, and later processes load the wrong variant without an error. Workers t
 processes.
 
 numba makes machine code of every loop that another one calls, and optimises it again in each caller. Here a loop that a compiled
-one calls is only linked into it, and optimised there, so that a fresh installation compiles in about half the time. A loop that
-Python calls is compiled and kept as numba does it. Every compiled loop of the package takes njit from here.
+one calls is only linked into it, and optimised there, and so is what numba itself has of numpy's functions, so that a fresh
+installation compiles in about half the time. It has one form for all constants of a type that callers pass. A loop that Python
+calls is compiled and kept as numba does it. Every compiled loop of the package takes njit from here.
 """
 
 from __future__ import annotations
 
+import gc
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
 from filelock import FileLock
-from numba.core import caching
+from numba import jit
+from numba.core import caching, types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
 from numba.core.registry import CPUDispatcher
 from numba.core.typed_passes import NativeLowering
+from numba.core.typing.templates import _OverloadFunctionTemplate
 
 __all__ = [
     "Boolx1",
@@ -46,6 +53,7 @@ __all__ = [
     "U8x2",
     "Uintpx1",
     "add_row",
+    "find_cache_folder",
     "njit",
     "set_row",
     "set_rows",
@@ -118,6 +126,16 @@ class _LinkedCompiler(CompilerBase):
         return [manager]
 
 
+def _get_jit_decorator(self: _OverloadFunctionTemplate) -> Any:
+    """Return numba's decorator for its implementations of numpy's and Python's functions; on the CPU they end as linked loops."""
+    decorator = _get_decorator(self)
+    return partial(decorator, pipeline_class=_LinkedCompiler, no_cfunc_wrapper=True) if decorator is jit else decorator
+
+
+_get_decorator = _OverloadFunctionTemplate._get_jit_decorator
+_OverloadFunctionTemplate._get_jit_decorator = _get_jit_decorator
+
+
 class _CompiledLoop(CPUDispatcher):
     """A loop to be called from Python, and its form for callers that are compiled."""
 
@@ -125,13 +143,18 @@ class _CompiledLoop(CPUDispatcher):
         self, py_func: Any, locals: Any = None, targetoptions: Any = None, pipeline_class: type[CompilerBase] = Compiler
     ) -> None:
         # Some versions of numba take no None.
-        locals, targetoptions = locals or {}, targetoptions or {}
+        locals, targetoptions = locals or {}, {**(targetoptions or {}), "no_cfunc_wrapper": True}
         super().__init__(py_func, locals, targetoptions, pipeline_class)
-        without_wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-        self._linked = CPUDispatcher(py_func, locals, {**targetoptions, **without_wrappers}, _LinkedCompiler)
+        self._linked = CPUDispatcher(py_func, locals, {**targetoptions, "no_cpython_wrapper": True}, _LinkedCompiler)
+
+    def compile(self, sig: Any) -> Any:
+        with _without_garbage_collection():
+            return super().compile(sig)
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
-        return self._linked.get_call_template(args, kws)
+        """Find the form for a compiled caller's types; one for all constants of a type, where numba compiles one for each."""
+        general = tuple(map(types.unliteral, args)), {name: types.unliteral(kind) for name, kind in kws.items()}
+        return self._linked.get_call_template(*general)
 
     def get_overload(self, sig: Any) -> Any:
         return self._linked.get_overload(sig)
@@ -141,19 +164,39 @@ class _CompiledLoop(CPUDispatcher):
         return super().is_compiling or self._linked.is_compiling
 
 
+@contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """Leave garbage for later: a compiler makes so many objects that all those of torch would be searched again and again."""
+    is_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if is_enabled:
+            gc.enable()
+
+
 def njit(*, cache: bool = False, **options: Any) -> Callable[[_Function], _Function]:
     """Return numba's decorator of the same name, for functions without signatures; options: its other options.
 
-    A loop is compiled at its first call, for the types of the arguments; cache: keep it on disk.
+    A loop is compiled at its first call, for the types of the arguments; cache: keep it on disk, where a folder can be written.
     """
 
     def decorate(function: _Function) -> _Function:
         loop = _CompiledLoop(function, targetoptions={"nopython": True, "boundscheck": None, **options})
         if cache:
-            loop.enable_caching()
+            # numba finds neither the package's folder nor that of the user writable.
+            with suppress(RuntimeError):
+                loop.enable_caching()
         return cast(_Function, loop)
 
     return decorate
+
+
+def find_cache_folder() -> Path | None:
+    """Return the folder where the loops of this module are kept on disk; None where they are not, as no folder can be written."""
+    path = cast(Any, set_row)._cache.cache_path
+    return None if path is None else Path(path)
 
 
 Int64 = int | np.int64

@@ -4,11 +4,15 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
+from manyeyes.cli import compile_ahead, main as cli
+from manyeyes.cli.compile_ahead import CompiledAhead
 from manyeyes.cli.doctor import Diagnosis, _table
 
 DIAGNOSIS = Diagnosis(
@@ -37,3 +41,23 @@ def read_lines(diagnosis: Diagnosis) -> dict[str, str]:
 )
 def test_a_line_of_the_table(changes: dict[str, object], name: str, wanted: str) -> None:
     assert read_lines(replace(DIAGNOSIS, **changes))[name] == wanted
+
+
+@pytest.mark.parametrize(
+    ("compiled", "wanted"),
+    [
+        (CompiledAhead(118, Path("/cache")), "118 loops compiled in 0 s; they are kept in /cache"),
+        (None, "Nothing was compiled: loops cannot be kept"),
+    ],
+)
+def test_loops_are_compiled_instead_of_the_diagnosis(
+    compiled: CompiledAhead | None, wanted: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def compile_nothing(progress: Callable[[int], None]) -> CompiledAhead | None:
+        progress(3)
+        return compiled
+
+    monkeypatch.setattr(compile_ahead, "compile_ahead", compile_nothing)
+    assert cli.main(["doctor", "--compile"]) == 0
+    out = capsys.readouterr().out
+    assert wanted in out and "versions" not in out

@@ -119,7 +119,7 @@ REQUIREMENTS: dict[str, tuple[Requirement, ...]] = {
         *_require_cloud("map"),
     ),
     "pose": (_GICP,),
-    "doctor": (),
+    "doctor": tuple(Requirement(extra, EXTRAS[extra]).when("compile", "True") for extra in ("sim", "view")),
     "report docs": (_MATPLOTLIB,),
     "report check-cells": (),
     "map build": (_ARROW, _SHAPELY, _MATPLOTLIB),

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from manyeyes._jit import I32x2, I64x1, I64x2, Int64, U8x1, U8x2, njit
 from manyeyes.comms.primitives import PacketError
 from manyeyes.datatypes import ConfigError
+from manyeyes.ops._sort_kernels import argsort, sort
 
 TOTAL_BITS = 12
 TOTAL = 1 << TOTAL_BITS
@@ -230,7 +231,7 @@ def _bits(order: _Order, at: int, count: int) -> int:  # pragma: no cover
     """Return the information content of so many cells from at on, in 2^-16 bits; more than any room where there are fewer."""
     if count > min(order.key.shape[0] - at, 65535):
         return 1 << 62
-    key = np.sort(order.key[at : at + count])
+    key = sort(order.key[at : at + count])
     contexts, counts = _contexts(key, order.height, order.width), _prior(count, order.height * order.width)
     bits, k = order.ends[at + count] - order.ends[at], 0
     for named in key:
@@ -269,7 +270,7 @@ def _stream_size(
         return 0
     if _bits(order, at, count) > (8 * (room - STATE_BYTES) + _SLACK_BITS) * _BIT:
         return -1
-    chosen = np.argsort(order.key[at : at + count]) + at
+    chosen = argsort(order.key[at : at + count]) + at
     used = _symbols(order.key[chosen], order.rows[chosen], order.height, order.width, tables, symbols)
     size = _size(symbols[:used])
     return size if size <= room else -1

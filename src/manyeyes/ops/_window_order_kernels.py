@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from manyeyes._jit import I64x1, njit
+from manyeyes.ops._sort_kernels import argsort
 
 _BITS = 20
 """Bits of a window's column in its number (``window_attention.window_ids``)."""
@@ -26,7 +27,7 @@ def order_windows(window: I64x1) -> I64x1:  # pragma: no cover
         first, last = min(first, w & mask), max(last, w & mask)
     columns, lines = last - first + 1, last_line - first_line + 1
     if lines > (_SPARSE * n + 64) // columns:
-        return np.argsort(window, kind="mergesort")
+        return argsort(window)
     place, order = np.zeros(lines * columns + 1, np.int64), np.empty(n, np.int64)
     for w in window:
         place[((w >> _BITS) - first_line) * columns + (w & mask) - first + 1] += 1

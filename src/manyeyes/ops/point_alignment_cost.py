@@ -15,6 +15,7 @@ from torch import Tensor
 
 from manyeyes._jit import F32x1, F32x2, F64x1, F64x2, I32x1, I64x1, njit
 from manyeyes.datatypes import Boxes
+from manyeyes.ops._sort_kernels import argsort
 
 MAX_DISTANCE_M = 0.4
 """A point whose nearest partner is farther has none."""
@@ -154,7 +155,7 @@ def _match(
         if partners < MIN_POINTS:
             continue
         count[n] = min(found, MAX_POINTS)
-        by_row = np.argsort(mine.rows[:found])
+        by_row = argsort(mine.rows[:found])
         for k in range(len(offset)):
             offset[k] = slack[n] * (2.0 * k / (steps - 1) - 1.0)
         for a in range(count[n]):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, I64x2, njit
+from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, I64x2, njit, set_row
 from manyeyes.datatypes.map_element import freeze, take_rows
 
 Floats = NDArray[np.float64]
@@ -173,7 +173,7 @@ def _resample(points: F64x2, offsets: I64x1, target: I64x1) -> F64x2:  # pragma:
             for axis in range(2):
                 out[target[row] + j, axis] = points[k, axis] + fraction * (points[after, axis] - points[k, axis])
         if count > 1:
-            out[target[row + 1] - 1] = points[end - 1]
+            set_row(out[target[row + 1] - 1], points[end - 1])
     return out
 
 

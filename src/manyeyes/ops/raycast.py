@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from manyeyes._jit import F32x2, F64x1, F64x2, F64x3, I32x2, U8x1, U8x2, njit
 from manyeyes.datatypes.errors import ShapeError
+from manyeyes.ops._sort_kernels import argsort
 
 BOX, CYLINDER, ELLIPSOID = 0, 1, 2
 NOTHING, GROUND = -1, -2
@@ -413,10 +414,10 @@ def _cast(solids: SolidArrays, pose: SensorPose, scan: _ScanPattern, seed: np.ui
                 )
         _interval(o[i], q[i], half[i], bounds[i])
         near[i] = bounds[i, _NEAREST]
-    for i in np.argsort(near, kind="mergesort"):
+    for i in argsort(near):
         if near[i] > scan.max_range:
             break
-        _draw(i, solids, o[i], q[i], bounds[i], scan, seed, image)
+        _draw(int(i), solids, o[i], q[i], bounds[i], scan, seed, image)
 
 
 @njit(cache=True)

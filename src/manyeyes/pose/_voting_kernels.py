@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from manyeyes._jit import Boolx1, Boolx2, F64x1, F64x2, F64x3, I64x1, I64x2, njit
+from manyeyes.ops._sort_kernels import argsort
 
 _PI = np.pi
 # Columns of a covariance (N, 3).
@@ -407,7 +408,7 @@ def match_one_to_one(
                 count += 1
     used_a, used_b = np.zeros(len(xy_a), np.bool_), np.zeros(len(xy_b), np.bool_)
     taken = 0
-    order = np.argsort(cost[:count], kind="mergesort")
+    order = argsort(cost[:count])
     pairs, misfit = np.empty((count, 2), np.int64), np.empty(count)
     for m in order:
         i, k = rows[m, 0], rows[m, 1]

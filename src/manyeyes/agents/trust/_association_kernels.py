@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from manyeyes._jit import Boolx1, Boolx2, F64x1, F64x2, I64x1, U8x1, njit
+from manyeyes.ops._sort_kernels import argsort
 
 
 @njit(cache=True, nogil=True)
@@ -27,7 +28,7 @@ def find_partners(one: F64x2, other: F64x2, gate_m: F64x1) -> I64x1:  # pragma: 
                 squared[at], rows[at], columns[at] = dx * dx + dy * dy, i, j
                 at += 1
     is_taken = np.zeros(m, np.bool_)
-    for k in np.argsort(squared, kind="mergesort"):
+    for k in argsort(squared):
         if partner[rows[k]] < 0 and not is_taken[columns[k]]:
             partner[rows[k]] = columns[k]
             is_taken[columns[k]] = True

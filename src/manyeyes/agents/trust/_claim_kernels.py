@@ -9,6 +9,7 @@ import numpy as np
 
 from manyeyes._jit import F32x1, F32x2, F64x1, F64x2, njit
 from manyeyes.models.detector._decode_kernels import DecodeLimits, RawColumns, decode_grid
+from manyeyes.ops._sort_kernels import argsort
 
 
 @njit(cache=True, nogil=True)
@@ -31,7 +32,7 @@ def place_claims(
     position (of both poses and of the motion since), m^2, and heading, rad^2; the minimum score.
     """
     seconds, variance_xy, variance_yaw, min_score = numbers
-    order = np.argsort(-score, kind="mergesort")[:max_claims]
+    order = argsort(-score)[:max_claims]
     columns, moved = np.empty((len(order), 7)), np.empty((len(order), 2))
     sigma_m, stated = np.empty(len(order)), np.empty((len(order), 2))
     scores, turn, count = np.empty(len(order)), math.atan2(rotation[1, 0], rotation[0, 0]), 0

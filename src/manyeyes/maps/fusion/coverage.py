@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx1, F64x2, I64x1, I64x2, njit, set_row
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays
+from manyeyes.ops._sort_kernels import sort
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -84,7 +85,7 @@ def fill_rings(corners: F64x2, first: I64x1) -> I64x2:  # pragma: no cover - com
                     meets[count] = corners[j, 0] + (corners[i, 0] - corners[j, 0]) * (y - y0) / (y1 - y0)
                     count += 1
                 j = i
-            across = np.sort(meets[:count])
+            across = sort(meets[:count])
             for k in range(0, count - 1, 2):
                 begin = int(np.ceil(across[k] / CELL_M - 0.5))
                 end = int(np.floor(across[k + 1] / CELL_M - 0.5))

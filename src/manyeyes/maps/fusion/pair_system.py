@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import F64x1, F64x2, I64x1, njit
+from manyeyes._jit import F64x1, F64x2, I64x1, njit, set_row, set_rows
 from manyeyes.maps.fusion.point_grid import find_cell_range, line_residual
+from manyeyes.ops._sort_kernels import sort
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -112,7 +113,7 @@ def sum_pairs(
             vote = total / (total + 0.5)
             own[h, 9] += vote * square / total
             own[h, 10] += vote
-        order = np.sort(met[:n])
+        order = sort(met[:n])
         while filled + n > len(other):
             other, shared = _longer(other), _taller(shared)
         _add_own(own[h], alone)
@@ -245,12 +246,12 @@ def _find_members(
 @njit(cache=True, nogil=True)
 def _longer(rows: I64x1) -> I64x1:  # pragma: no cover - compiled
     bigger = np.empty(2 * len(rows), np.int64)
-    bigger[: len(rows)] = rows
+    set_row(bigger[: len(rows)], rows)
     return bigger
 
 
 @njit(cache=True, nogil=True)
 def _taller(rows: F64x2) -> F64x2:  # pragma: no cover - compiled
     bigger = np.empty((2 * len(rows), rows.shape[1]))
-    bigger[: len(rows)] = rows
+    set_rows(bigger[: len(rows)], rows)
     return bigger

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from manyeyes._jit import F32x1, F32x2, I64x1, njit
+from manyeyes.ops._sort_kernels import argsort
 from manyeyes.ops.nms import find_kept
 
 
@@ -110,7 +111,7 @@ def decode_grid(
     """Return the boxes of raw boxes (N, total) on cells at xy (N, 2), with heat logits (N,)."""
     score = _scores(raw, heat, columns.iou, limits.iou_score_weight, limits.score_threshold)
     rows = np.flatnonzero(score > limits.score_threshold)
-    rows = rows[np.argsort(-score[rows], kind="mergesort")]
+    rows = rows[argsort(-score[rows])]
     n = len(rows)
     found = _empty(n)
     for i in range(n):

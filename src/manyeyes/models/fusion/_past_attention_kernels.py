@@ -124,5 +124,5 @@ def attend_past(
         normalize_rows(some, vectors.feed_forward_norm_weight, vectors.feed_forward_norm_bias, there)
         add_feed_forward(there, matrices, vectors.hidden, vectors.feed_forward, some)
     for i in range(n):
-        out[chosen[i]] = x[i]
+        set_row(out[chosen[i]], x[i])
     return out

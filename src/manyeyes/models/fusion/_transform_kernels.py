@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from manyeyes._jit import F32x1, F32x2, F64x1, F64x2, I64x1, njit
+from manyeyes._jit import F32x1, F32x2, F64x1, F64x2, I64x1, njit, set_row
 
 
 class ProposalColumns(NamedTuple):
@@ -83,8 +83,10 @@ def move_tokens(
 def _copy_token(token: F32x1, xy: F32x1, out: MovedTokens, at: int) -> None:  # pragma: no cover
     """Write one of the ego's own current tokens to row at."""
     channels = out.features.shape[1]
-    out.features[at], out.proposal[at] = token[:channels], token[channels:]
-    out.xy[at], out.pose_context[at] = xy, np.float32(0)
+    set_row(out.features[at], token)
+    set_row(out.proposal[at], token[channels:])
+    set_row(out.xy[at], xy)
+    out.pose_context[at] = np.float32(0)
 
 
 @njit(cache=True, nogil=True)
