@@ -128,12 +128,15 @@ class _LinkedCompiler(CompilerBase):
 
 def _get_jit_decorator(self: _OverloadFunctionTemplate) -> Any:
     """Return numba's decorator for its implementations of numpy's and Python's functions; on the CPU they end as linked loops."""
+    assert _get_decorator is not None
     decorator = _get_decorator(self)
     return partial(decorator, pipeline_class=_LinkedCompiler, no_cfunc_wrapper=True) if decorator is jit else decorator
 
 
-_get_decorator = _OverloadFunctionTemplate._get_jit_decorator
-_OverloadFunctionTemplate._get_jit_decorator = _get_jit_decorator
+# A version of numba without the method compiles its own functions as they are, which takes longer.
+_get_decorator = getattr(_OverloadFunctionTemplate, "_get_jit_decorator", None)
+if _get_decorator is not None:
+    _OverloadFunctionTemplate._get_jit_decorator = _get_jit_decorator
 
 
 class _CompiledLoop(CPUDispatcher):
