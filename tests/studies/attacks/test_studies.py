@@ -73,6 +73,7 @@ def test_every_attack_has_its_baselines() -> None:
     ("words", "text"),
     [
         (("--attacks", "none-such"), "known: ghost-1-seen"),
+        (("--attacks", "false-sight"), "add --sight"),
         (("--defences", "oracle"), "is always a row"),
         (("--defences", "none-such"), "known:"),
         (("--misbehaviour", "none"), "leave out --misbehaviour"),
