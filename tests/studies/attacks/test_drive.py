@@ -24,7 +24,7 @@ from manyeyes.studies.attacks.roles import FIRST_PSEUDONYM, Roles, choose_roles
 CONFIG = ReplayConfig(channel="its-g5-6", latency_budget_s=0.1, budget_bytes=4096)
 METHODS = ("late", "intermediate-temporal")
 ROLES = Roles(5, (6,))
-NOTHING_FREE = Sight(np.zeros(NUM_SECTORS))
+NOTHING_FREE = Sight(np.zeros(NUM_SECTORS, np.uint8))
 
 
 @pytest.fixture(scope="module")

@@ -108,8 +108,7 @@ def test_the_study_false_accusations_counts_sender_minutes(tmp_path, monkeypatch
 def test_agents_of_honest_drives_send_sights_on_request(tmp_path, sight) -> None:
     weights = write_weights(tmp_path / "weights.safetensors")
     player = _Player.make("none", FalseAccusationsOptions(weights=str(weights), sight=sight), {})
-    for index in range(2):
-        steps = list(player.replay.step(make_snapshot("a", index)))
+    _, steps = (list(player.replay.step(make_snapshot("a", index))) for index in range(2))
     received = [one.message for step in steps for one in step.perception.received]
     assert len(received) == 4 * 3 and all((message.sight is not None) is sight for message in received)
 
