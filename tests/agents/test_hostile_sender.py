@@ -6,6 +6,7 @@ Attacks are those of ``tests.probes.hostile``.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings, strategies as st
-from tests.probes.hostile import HOSTILE_ID, attack_packets
+from tests.probes.hostile import ATTACKS, HOSTILE_ID, attack_packets
 
 from manyeyes import Agent, Boxes
 from manyeyes.agents.agent import Perception
@@ -24,10 +25,12 @@ from manyeyes.agents.own_detections import MIN_RESTORED_SCORE
 from manyeyes.agents.strategies import early
 from manyeyes.agents.strategies.message_header import make_header
 from manyeyes.agents.strategies.registry import FusionStrategy, get_strategy, list_strategies
+from manyeyes.agents.trust.detectors.ray_evidence import RayEvidenceDetector
 from manyeyes.comms import wire
 from manyeyes.comms.inbox import Inbox
 from manyeyes.datatypes import AgentFrame, Message, PointCloud, Sites, SparseBev, Transform
 from manyeyes.models.detector.box_head import BOX_LAYOUT
+from manyeyes.models.detector.detector import Detector
 
 INSTANTS = range(2, 5)
 TENTH_NS = 100_000_000
@@ -166,6 +169,80 @@ def test_no_attack_removes_an_own_detection(drive, confident, scene_of, name: st
         own = ego.perception_cache.process(frame).boxes
         own = own[(own.score >= MIN_RESTORED_SCORE) & (own.center[:, :2].abs() > torch.tensor([3.7, 2.4])).any(1)]
         assert len(own) and float(nearest_m(own, perception.boxes).max()) <= 1.0
+
+
+SIGHTS = {
+    "sight of the largest ranges": None,
+    "sight of nothing": None,
+    "sight of NaN as float32": None,
+    "sight of the largest covariance": "pose",
+    "sight at 1e8 m": "implausible",
+    "sight from 900 m away": None,
+    "sight from 40 m above": None,
+    "sight of a sender upside down": "pose",
+    "sight of NaN, a float32 a sector": "garbage",
+    "sight of a sector too few": "garbage",
+    "sight of a sector too many": "garbage",
+    "sight of 60,000 sectors": "garbage",
+    "sight cut in the middle": "garbage",
+    "sight without a body": "garbage",
+    "two sights in a message": "contradiction",
+    "sights of 100 senders": "busy",
+}
+"""What is refused of each hostile sight; None: nothing, it is a sight like others."""
+
+
+@dataclass(frozen=True)
+class SightScene:
+    """A scene where the honest senders send sights, and the ego assesses senders.
+
+    What a false sight of a trusted sender does to claims is in ``tests.agents.trust.test_observers``.
+    """
+
+    scene: Scene
+    detector: Detector
+
+    def perceive(self, attack: str | None) -> tuple[list[Perception], Counter[str]]:
+        """Perceive all instants, beside an attack or without any; return what the inboxes dropped, too."""
+        defence = RayEvidenceDetector()
+        ego, dropped, found = Agent(self.detector, get_strategy("late"), misbehaviour=defence), Counter[str](), []
+        for frame, sent in zip(self.scene.frames, self.scene.packets):
+            inbox = ego.inbox()
+            bad = [] if attack is None else attack_packets(attack, sent[0], frame.timestamp_ns)
+            for packet in (*(packet for packets in sent for packet in packets), *bad):
+                inbox.push(packet, frame.timestamp_ns)
+            found.append(ego.perceive(frame, inbox, frame.timestamp_ns))
+            dropped.update({reason: count for reason, count in vars(inbox.dropped).items() if count})
+        return found, dropped
+
+
+@pytest.fixture(scope="module")
+def with_sights(drive, detector) -> SightScene:
+    agents = {i: Agent(detector, get_strategy("late"), send_sight=True) for i in SENDERS}
+    packets = [tuple(agents[i].share(drive(4).frame(i, index)) for i in SENDERS) for index in INSTANTS]
+    return SightScene(Scene(tuple(drive(4).frame(0, index) for index in INSTANTS), tuple(packets)), detector)
+
+
+@pytest.mark.parametrize("attack", SIGHTS)
+def test_a_hostile_sight_changes_no_box_and_no_honest_sender_and_is_refused_where_it_is_wrong(
+    with_sights, attack: str
+) -> None:
+    clean, _ = with_sights.perceive(None)
+    struck, dropped = with_sights.perceive(attack)
+    rejected = Counter(r.reason for p in struck for r in p.rejected)
+    assert set(dropped) | set(rejected) == ({SIGHTS[attack]} if SIGHTS[attack] else set())
+    for before, after in zip(clean, struck):
+        assert before.assessment is not None and after.assessment is not None
+        honest = [
+            {s.agent_id: (s.trust, s.weight, s.status) for s in one.assessment.senders if s.agent_id in SENDERS}
+            for one in (before, after)
+        ]
+        assert honest[0] == honest[1] and len(honest[0]) == len(SENDERS)
+        assert same(before.boxes, after.boxes)
+
+
+def test_hostile_sights_are_all_named() -> None:
+    assert {name for name in ATTACKS if "sight" in name} == set(SIGHTS)
 
 
 @st.composite

@@ -7,6 +7,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -14,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-NONE, TOKENS, OBJECTS, POINTS, REQUEST, ELEMENTS = range(6)
+NONE, TOKENS, OBJECTS, POINTS, REQUEST, ELEMENTS, SIGHT = range(7)
 FLOAT32, FLOAT16, INT8, CODES = range(4)
 GAPS, BITMAP, CODED = range(3)
 SECOND_NS = 1_000_000_000
@@ -22,6 +23,7 @@ HOUR_NS = 3600 * SECOND_NS
 BODY_OFFSET, GRID_BYTES = 64, 15
 HOSTILE_ID = 66
 SCALE_OF_1 = 129
+NUM_SECTORS = 180
 
 _HEADER = struct.Struct("<2sBBHHiq6s6s6s3i3B3b8s")
 _TOKEN_FORM = struct.Struct("<BHH")
@@ -250,6 +252,7 @@ BODY_FIELDS = {
     POINTS: (*_POINT_FIELDS, Field("intensity", BODY_OFFSET + 6, "B")),
     REQUEST: (*_GRID_FIELDS, Field("confidence", BODY_OFFSET + 15, "Q")),
     ELEMENTS: _ELEMENT_FIELDS,
+    SIGHT: tuple(Field(f"sector {k}", BODY_OFFSET + k, "B") for k in (0, NUM_SECTORS - 1)),
 }
 
 
@@ -516,6 +519,43 @@ def _descriptors(template: Template, now_ns: int) -> list[bytes]:
         for k, fill in enumerate((b"\x7f" * 32, b"\x81" * 32, bytes(32)))
     )
     return template.header.message([(OBJECTS, b"\x03" + rows)])
+
+
+def _sight(*bodies: bytes, metres: tuple[int, int, int] = (3, 0, 0), **fields: object) -> Attack:
+    """Return the attack of a message of sights alone, as of a place some metres from the honest sender. fields: of the header."""
+
+    def attack(template: Template, now_ns: int) -> list[bytes]:
+        x, y, z = (at + (step << 20) for at, step in zip(template.header.position, metres))
+        return replace(template.header, position=(x, y, z), **fields).message([(SIGHT, body) for body in bodies])
+
+    return attack
+
+
+_ALL_FREE, _NAN = b"\xff" * NUM_SECTORS, struct.pack("<f", math.nan)
+ATTACKS["sight of the largest ranges"] = _sight(_ALL_FREE)
+ATTACKS["sight of nothing"] = _sight(bytes(NUM_SECTORS))
+ATTACKS["sight of NaN as float32"] = _sight(_NAN * (NUM_SECTORS // 4))
+ATTACKS["sight of NaN, a float32 a sector"] = _sight(_NAN * NUM_SECTORS)
+ATTACKS["sight of a sector too few"] = _sight(_ALL_FREE[1:])
+ATTACKS["sight of a sector too many"] = _sight(_ALL_FREE + b"\xff")
+ATTACKS["sight of 60,000 sectors"] = _sight(b"\xff" * 60_000)
+ATTACKS["sight cut in the middle"] = _sight(_ALL_FREE[: NUM_SECTORS // 2])
+ATTACKS["sight without a body"] = _sight(b"")
+ATTACKS["two sights in a message"] = _sight(bytes(NUM_SECTORS), _ALL_FREE)
+ATTACKS["sight of the largest covariance"] = _sight(_ALL_FREE, sigma=(255, 255, 255))
+ATTACKS["sight at 1e8 m"] = _sight(_ALL_FREE, metres=(10**8, -(10**8), 0))
+ATTACKS["sight from 900 m away"] = _sight(_ALL_FREE, metres=(900, 0, 0))
+ATTACKS["sight from 40 m above"] = _sight(_ALL_FREE, metres=(3, 0, 40))
+
+
+@_attack("sight of a sender upside down")
+def _sight_upside_down(template: Template, now_ns: int) -> list[bytes]:
+    return _sight(_ALL_FREE, rotation=(0, 0, 0), flags=template.header.flags & ~0x30 | 0x10)(template, now_ns)
+
+
+@_attack("sights of 100 senders")
+def _many_sights(template: Template, now_ns: int) -> list[bytes]:
+    return [p for k in range(100) for p in _sight(_ALL_FREE, metres=(3, 3 * k, 0), agent_id=100 + k)(template, now_ns)]
 
 
 @_attack("10,000 map elements")

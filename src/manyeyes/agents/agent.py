@@ -208,7 +208,7 @@ class Agent:
         sends_request_map = self.send_request_map or getattr(self.strategy, "needs_request_map", False)
         if message is not None and message.tokens is not None and sends_request_map and message.request is None:
             message = replace(message, request=make_request_map(self.perception_cache, frame))
-        if message is not None and self.send_sight:
+        if message is not None and self.send_sight and message.sight is None:
             message = replace(message, sight=measure_sight(frame.points.xyz, frame.sensor_height_m))
         return message
 

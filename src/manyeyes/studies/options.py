@@ -171,6 +171,9 @@ class FalseAccusationsOptions(StudyOptions):
     """Strategy of all agents."""
     defences: tuple[str, ...] = ("ray-evidence",)
     """Misbehaviour detectors by name."""
+    sight: bool = False
+    """Send with each message how far the space around the sender's LiDAR is free, 248 bytes, by which two trusted senders refute
+    what the ego cannot see."""
     variants: tuple[Literal["clean", "glass", "rain"], ...] = ("clean", "glass", "rain")
     """Returns as simulated, through glass, or in rain."""
     towns: tuple[str, ...] = ("Town07",)

@@ -26,7 +26,7 @@ from tests.agents.trust.street import HEIGHT_M, SEEN, TENTH_NS, cars, kinds, sca
 from manyeyes.agents.trust.claims import Claims
 from manyeyes.agents.trust.detectors.ray_evidence import RayEvidenceDetector
 from manyeyes.agents.trust.interface import Assessment, Evidence, MisbehaviourInput, SenderStatus
-from manyeyes.agents.trust.observers import ObserverConfig
+from manyeyes.agents.trust.observers import ObserverConfig, PlacedBoxes, count_observers
 from manyeyes.datatypes import AgentFrame, Boxes, Message, PointCloud, Sight, Transform
 from manyeyes.datatypes.sight import NUM_SECTORS
 from manyeyes.ops.lidar.free_range import measure_sight
@@ -209,6 +209,35 @@ def test_a_observer_of_large_pose_error_concludes_nothing():
         assert ghost_kind(after_trust(WITH_TWO).step(unsure)) == UNCHECKED
     small = {**WITH_TWO, 3: replace(WITH_TWO[3], sigma_m=0.4, sigma_yaw=0.007)}
     assert ghost_kind(after_trust(WITH_TWO).step(small)) == REFUTED
+
+
+def is_refuted_beyond(gap_m: float, sigma_m: float, config: ObserverConfig) -> bool:
+    """Whether one sight refutes a car ahead whose footprint lies gap_m within the free range of 40 m, at its corners.
+
+    sigma_m: of the claim; poses are exact.
+    """
+    place = Message(2, 0, Transform.identity(), torch.zeros(3, 3).double(), sight=Sight(np.full(NUM_SECTORS, 80)))
+    half = np.array([2.25, 0.95]) + gap_m
+    ahead = math.sqrt(40.0**2 - half[1] ** 2) - half[0]
+    claims = [
+        Claims.of(1, cars((ahead, 0.0)), np.array([sigma_m])),
+        replace(Claims.of(2, cars(), np.zeros(0)), sender_xy=(50.0, 0.0)),
+    ]
+    frame = AgentFrame.of(PointCloud.of(torch.zeros(0, 3)), Transform.identity(), 0, 0)
+    messages = (replace(place, agent_id=1, sight=None), place)
+    nothing = PlacedBoxes(np.zeros((0, 7)), np.zeros((0, 2)), np.zeros(0))
+    counts = count_observers(frame, messages, claims, nothing, {2}, 0.02, 0.6, replace(config, min_observers=1))
+    return bool(counts[0][0])
+
+
+@pytest.mark.parametrize("min_sigma_m", [0.1, 0.3, 0.6])
+@pytest.mark.parametrize("sigma_m", [0.0, 0.2, 0.5])
+def test_the_margin_is_that_of_the_larger_standard_deviation_of_claim_and_bound(min_sigma_m, sigma_m):
+    """A claim that is stated without error has that of min_sigma_m; one of a larger error keeps its own."""
+    config = ObserverConfig(min_sigma_m=min_sigma_m)
+    margin_m = config.margin_m + config.num_sigmas * max(sigma_m, min_sigma_m)
+    assert is_refuted_beyond(margin_m + 0.01, sigma_m, config)
+    assert not is_refuted_beyond(margin_m - 0.01, sigma_m, config)
 
 
 def test_a_turned_observer_counts_alike():

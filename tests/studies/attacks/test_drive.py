@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Laws of a drive under attack, on a small scene with weights that were never trained."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
+import numpy as np
 import pytest
 import torch
 from tests.studies.attacks.scene import make_detector, make_snapshot
@@ -10,17 +11,20 @@ from tests.studies.attacks.scene import make_detector, make_snapshot
 from manyeyes.agents.own_detections import SAME_OBJECT_DISTANCE_M
 from manyeyes.agents.replay import DetectionReplay, ReplayConfig
 from manyeyes.agents.trust.registry import get_misbehaviour_detector
-from manyeyes.datatypes import Boxes
+from manyeyes.datatypes import Boxes, Sight
+from manyeyes.datatypes.sight import NUM_SECTORS
 from manyeyes.models.detector.detector import Detector
 from manyeyes.studies.attacks.catalog import ATTACKS
 from manyeyes.studies.attacks.drive import AttackedDrive, DriveSetting, DriveStep
 from manyeyes.studies.attacks.families.ghost import GhostAttack
+from manyeyes.studies.attacks.interface import AlterMessage, AttackInput, AttackKey, AttackOutput, AttackSettings
 from manyeyes.studies.attacks.recording import DriveRecorder
 from manyeyes.studies.attacks.roles import FIRST_PSEUDONYM, Roles, choose_roles
 
 CONFIG = ReplayConfig(channel="its-g5-6", latency_budget_s=0.1, budget_bytes=4096)
 METHODS = ("late", "intermediate-temporal")
 ROLES = Roles(5, (6,))
+NOTHING_FREE = Sight(np.zeros(NUM_SECTORS, np.uint8))
 
 
 @pytest.fixture(scope="module")
@@ -43,10 +47,12 @@ def same_boxes(a: Boxes, b: Boxes) -> bool:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("sends_sights", [False, True])
 @pytest.mark.parametrize("method", METHODS)
-def test_without_malicious_agents_a_drive_is_the_replay_bit_for_bit(detector, cache, method) -> None:
-    replayed = DetectionReplay(method, detector, CONFIG)
-    for index, played in enumerate(play(detector, cache, DriveSetting(method, CONFIG, Roles(5, ())))):
+def test_without_malicious_agents_a_drive_is_the_replay_bit_for_bit(detector, cache, method, sends_sights) -> None:
+    config = replace(CONFIG, send_sight=sends_sights)
+    replayed = DetectionReplay(method, detector, config)
+    for index, played in enumerate(play(detector, cache, DriveSetting(method, config, Roles(5, ())))):
         (step,) = replayed.step(make_snapshot("a", index))
         assert same_boxes(step.boxes, played.step.boxes)
         assert [s.packet_sizes for s in step.sent] == [s.packet_sizes for s in played.step.sent]
@@ -70,6 +76,33 @@ def test_an_attack_changes_no_message_before_it_begins_and_no_honest_one_after(d
             drive.play(make_snapshot("a", index), index >= 2)
     for index, (honest, attacked) in enumerate(zip(sent["none"], sent["ghost"])):
         assert {k for k in honest if honest[k] != attacked[k]} == ({6} if index >= 2 else set())
+
+
+@dataclass(frozen=True)
+class SightAttack(AttackSettings):
+    """State that nothing is free; sights: the honest ones."""
+
+    sights: list[Sight | None] = field(default_factory=list)
+
+    def begin(self, key: AttackKey) -> AlterMessage:
+        return self.alter
+
+    def alter(self, given: AttackInput) -> AttackOutput:
+        self.sights.append(given.message.sight)
+        return AttackOutput(replace(given.message, sight=NOTHING_FREE))
+
+
+@pytest.mark.slow
+def test_an_attack_is_given_the_honest_sight_and_its_own_is_sent(detector, cache) -> None:
+    attack, config = SightAttack(), replace(CONFIG, send_sight=True)
+    honest, attacked = (
+        play(detector, cache, DriveSetting("late", config, ROLES, one), begin=2, frames=3)[-1].step.perception.received
+        for one in (None, attack)
+    )
+    wanted, sent = ({r.message.agent_id: r.message.sight.steps for r in received} for received in (honest, attacked))
+    (given,) = attack.sights
+    assert given is not None and np.array_equal(given.steps, wanted[6]) and wanted[6].any()
+    assert not sent[6].any() and all(np.array_equal(sent[k], wanted[k]) for k in (7, 8))
 
 
 @pytest.mark.slow

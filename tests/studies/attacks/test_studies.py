@@ -2,14 +2,16 @@
 """The studies attacks and false-accusations from end to end, on small scenes, with weights that were never trained."""
 
 import json
+from dataclasses import replace
 
 import pytest
-from tests.studies.attacks.scene import write_recording, write_weights
+from tests.studies.attacks.scene import make_snapshot, write_recording, write_weights
 
 from manyeyes.cli import main as cli
 from manyeyes.studies.attacks import false_accusations
 from manyeyes.studies.attacks.conditions import NO_ATTACK, NO_DEFENCE, ORACLE, AttackCondition, list_pairs
-from manyeyes.studies.attacks.false_accusations import make_specs
+from manyeyes.studies.attacks.false_accusations import HonestDrive, _Player, make_specs
+from manyeyes.studies.engine.cells import CellStore
 from manyeyes.studies.options import FalseAccusationsOptions
 
 
@@ -71,6 +73,7 @@ def test_every_attack_has_its_baselines() -> None:
     ("words", "text"),
     [
         (("--attacks", "none-such"), "known: ghost-1-seen"),
+        (("--attacks", "false-sight"), "add --sight"),
         (("--defences", "oracle"), "is always a row"),
         (("--defences", "none-such"), "known:"),
         (("--misbehaviour", "none"), "leave out --misbehaviour"),
@@ -99,6 +102,25 @@ def test_the_study_false_accusations_counts_sender_minutes(tmp_path, monkeypatch
         assert rate["events"] == 0 and 0 < rate["minutes"] <= 20 * 0.5 / 60 and rate["upper"] > 1
     monkeypatch.setattr(false_accusations.HonestDrive, "_play", lambda self, pairs: pytest.fail("played again"))
     assert cli.main([str(word) for word in words]) == 0
+
+
+@pytest.mark.parametrize("sight", [False, True])
+def test_agents_of_honest_drives_send_sights_on_request(tmp_path, sight) -> None:
+    weights = write_weights(tmp_path / "weights.safetensors")
+    player = _Player.make("none", FalseAccusationsOptions(weights=str(weights), sight=sight), {})
+    _, steps = (list(player.replay.step(make_snapshot("a", index))) for index in range(2))
+    received = [one.message for step in steps for one in step.perception.received]
+    assert len(received) == 4 * 3 and all((message.sight is not None) is sight for message in received)
+
+
+def test_drives_with_and_without_sights_are_stored_apart(tmp_path) -> None:
+    options, store = (
+        FalseAccusationsOptions(weights=str(write_weights(tmp_path / "weights.safetensors"))),
+        CellStore(tmp_path),
+    )
+    (spec, *_) = make_specs(options)
+    drives = (HonestDrive(spec, "clean", replace(options, sight=sight), store) for sight in (True, False))
+    assert len({store.path(drive.make_cell("ray-evidence")) for drive in drives}) == 2
 
 
 def test_drives_differ_and_their_length_is_the_stated_one() -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from manyeyes.datatypes import ConfigError
 from manyeyes.studies.attacks.families.alternation import OnOffAttack
 from manyeyes.studies.attacks.families.displacement import ObjectShiftAttack, PoseShiftAttack
+from manyeyes.studies.attacks.families.false_sight import FalseSightAttack
 from manyeyes.studies.attacks.families.feature_noise import FeatureNoiseAttack
 from manyeyes.studies.attacks.families.flooding import FloodAttack
 from manyeyes.studies.attacks.families.framing import FramingAttack
@@ -25,13 +26,14 @@ from manyeyes.studies.attacks.interface import Attack
 class NamedAttack:
     """An attack of the table. num_malicious: agents that attack by default. colluding: they share one random key.
 
-    needs_tokens: it changes nothing in messages without tokens.
+    needs_tokens, needs_sights: it changes nothing in messages without tokens, or without sights.
     """
 
     attack: Attack
     num_malicious: int = 1
     colluding: bool = False
     needs_tokens: bool = False
+    needs_sights: bool = False
 
 
 ATTACKS: dict[str, NamedAttack] = {
@@ -72,6 +74,7 @@ ATTACKS: dict[str, NamedAttack] = {
     "collude-3-blind": NamedAttack(GhostAttack(3, "blind"), 2, colluding=True),
     "sybil-8": NamedAttack(GhostAttack(3, "seen", num_pseudonyms=8)),
     "frame": NamedAttack(FramingAttack()),
+    "false-sight": NamedAttack(FalseSightAttack(), needs_sights=True),
     "flood": NamedAttack(FloodAttack()),
 }
 

@@ -22,6 +22,7 @@ from manyeyes.agents.token_codec import decode_tokens
 from manyeyes.comms.inbox import Inbox
 from manyeyes.datatypes import AgentFrame, Message, Snapshot, Transform
 from manyeyes.models.detector.protocols import BoxDetector
+from manyeyes.ops.lidar.free_range import measure_sight
 from manyeyes.studies.attacks.interface import (
     AlterMessage,
     Attack,
@@ -188,6 +189,8 @@ class AttackedDrive:
     def _alter(self, agent_id: int, cache: PerceptionCache, frame: AgentFrame, message: Message) -> AttackOutput:
         """Run the attack of one malicious identity; the honest message before the attack begins."""
         attack, roles = self.setting.attack, self.setting.roles
+        if self.setting.replay.send_sight:
+            message = replace(message, sight=measure_sight(frame.points.xyz, frame.sensor_height_m))
         if attack is None or self._instant < 0:
             return AttackOutput(message)
         if agent_id not in self._running:

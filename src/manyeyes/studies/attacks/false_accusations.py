@@ -59,7 +59,8 @@ class HonestDrive:
         """Describe the stored record of one defence."""
         options, weights = self.options, load_detector(self.options.weights).fingerprint.hex()
         errors = options.position_sigma_m, options.heading_sigma_deg, options.seed
-        key = (self.spec, self.variant, get_misbehaviour_detector(defence), options.method, weights, errors)
+        sent = options.method, options.sight
+        key = (self.spec, self.variant, get_misbehaviour_detector(defence), sent, weights, errors)
         return Cell(f"{self.spec.name}-{self.variant}-{defence}", DriveRecord, key, COMPUTED_BY)
 
     def _play(self, defences: Sequence[str]) -> list[DriveRecord]:
@@ -97,6 +98,7 @@ class _Player:
             latency_budget_s=LATENCY_BUDGET_S,
             all_egos=True,
             seed=options.seed,
+            send_sight=options.sight,
             misbehaviour=get_misbehaviour_detector(defence),
         )
         return cls(DetectionReplay(options.method, load_detector(options.weights), config, cache))
@@ -167,7 +169,8 @@ def run(options: FalseAccusationsOptions, context: StudyContext) -> None:
         for variant in options.variants
         for k, defence in enumerate(options.defences)
     )
-    title = f"{len(specs)} drives of {options.seconds:g} s in {', '.join(options.towns)}, every agent as ego, {options.method}"
+    method = f"{options.method} with sights" if options.sight else options.method
+    title = f"{len(specs)} drives of {options.seconds:g} s in {', '.join(options.towns)}, every agent as ego, {method}"
     context.write_report(title, {"rows": rows}, [make_table(rows)], config={"specs": specs})
 
 

@@ -55,10 +55,10 @@ class Victim:
 class AttackInput:
     """What a malicious agent has at one instant.
 
-    frame: its own levelled frame. message: its honest message, tokens as floats before selection. received: the newest messages of
-    other agents as of the instant before. victim_pose: the pose that the ego states, world from ego. instant: number of instants
-    since the attack began. gather: of the malicious agent itself. detector: the weights; None for a black box. victim: None but for
-    a white box.
+    frame: its own levelled frame. message: its honest message, tokens as floats before selection, with its sight where agents send
+    sights. received: the newest messages of other agents as of the instant before. victim_pose: the pose that the ego states, world
+    from ego. instant: number of instants since the attack began. gather: of the malicious agent itself. detector: the weights; None
+    for a black box. victim: None but for a white box.
     """
 
     frame: AgentFrame

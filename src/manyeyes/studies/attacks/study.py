@@ -46,7 +46,9 @@ NOTE = (
 def run(options: AttacksOptions, context: StudyContext) -> None:
     """Run the study and write its report."""
     study = _prepare(options, context)
-    pairs = list_pairs(options.attacks or tuple(ATTACKS), study.base.methods, options.defences, options.counts)
+    sends_sights = options.replay_options.sight
+    usable = tuple(name for name, named in ATTACKS.items() if sends_sights or not named.needs_sights)
+    pairs = list_pairs(options.attacks or usable, study.base.methods, options.defences, options.counts)
     recording = study.base.filter_recording(study.opener())
     scenarios = recording.scenarios
     digest = hash_recording(recording)
@@ -81,7 +83,8 @@ def run(options: AttacksOptions, context: StudyContext) -> None:
 def _prepare(options: AttacksOptions, context: StudyContext) -> ReplayStudy:
     """Open the recording, and refuse unknown names before any work."""
     for name in options.attacks:
-        get_attack(name)
+        if get_attack(name).needs_sights and not options.replay_options.sight:
+            raise ConfigError(f"--attacks: {name} alters the sights of messages; add --sight.")
     for name in options.defences:
         if name in (NO_DEFENCE, ORACLE):
             raise ConfigError(f"--defences: {name} is always a row; name misbehaviour detectors.")
