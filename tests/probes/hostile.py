@@ -42,7 +42,9 @@ def kind_of(packet: bytes) -> int:
 
 @dataclass(frozen=True)
 class Header:
-    """All fields of a header, as they stand in a packet, apart from the kind of body. position: x, y, z in 2^-20 m."""
+    """All fields of a header, as they stand in a packet, apart from the kind of body. position: x, y, z in 2^-20 m. version: of the
+    format of the body; crafted ones are of the oldest.
+    """
 
     agent_id: int
     time_ns: int
@@ -54,6 +56,7 @@ class Header:
     flags: int = 0
     number: int = 0
     count: int = 1
+    version: int = 2
 
     @classmethod
     def read(cls, packet: bytes) -> Header:
@@ -78,7 +81,7 @@ class Header:
         place = [v.to_bytes(6, "little", signed=True) for v in self.position]
         values = (*place, *self.rotation, *self.sigma, *self.correlation, self.fingerprint)
         flags = self.flags | kind
-        head = _HEADER.pack(b"ME", 2, flags, self.number, self.count, self.agent_id, self.time_ns, *values)
+        head = _HEADER.pack(b"ME", self.version, flags, self.number, self.count, self.agent_id, self.time_ns, *values)
         return seal(head + body)
 
     def message(self, bodies: Sequence[tuple[int, bytes]]) -> list[bytes]:
@@ -119,11 +122,6 @@ class Template:
         x0, y0, _, x1, y1, _, pillar, stride = struct.unpack("<6hHB", self.grid)
         cell = pillar * stride / 10
         return round((y1 - y0) / cell), round((x1 - x0) / cell)
-
-    def own_objects(self) -> list[tuple[int, bytes]]:
-        """Return the honest objects again, as bodies; a body without rows where there are none."""
-        bodies = [(OBJECTS, p[BODY_OFFSET:-4]) for p in self.packets if kind_of(p) == OBJECTS]
-        return bodies or [(OBJECTS, b"\0")]
 
 
 # Bodies.
@@ -384,10 +382,18 @@ def _latest(template: Template, now_ns: int) -> list[bytes]:
     return _resent(template, time_ns=(1 << 63) - 1)
 
 
+def _few_objects() -> tuple[int, bytes]:
+    """Return a plausible body: three boxes."""
+    return OBJECTS, object_body(np.array([(12.0, 3.0), (25.0, -4.0), (40.0, 3.5)]))
+
+
 def _resent(template: Template, **fields: object) -> list[bytes]:
     """Return the honest packets as of the hostile sender, with other fields in their headers."""
-    head = replace(template.header, **fields)
-    return head.message([(kind_of(packet), packet[BODY_OFFSET:-4]) for packet in template.packets])
+    head = replace(template.header, count=len(template.packets), **fields)
+    return [
+        replace(head, number=n, version=packet[2]).packet(kind_of(packet), packet[BODY_OFFSET:-4])
+        for n, packet in enumerate(template.packets)
+    ]
 
 
 @_attack("height of 1e6 m")
@@ -509,7 +515,7 @@ def _points_at_extremes(template: Template, now_ns: int) -> list[bytes]:
 @_attack("largest request map")
 def _large_request(template: Template, now_ns: int) -> list[bytes]:
     grid = struct.pack("<6hHB", -20480, -20480, -300, 20480, 20480, 500, 100, 1)
-    return template.header.message([*template.own_objects(), (REQUEST, grid + b"\xff" * (1 << 24))])
+    return template.header.message([_few_objects(), (REQUEST, grid + b"\xff" * (1 << 24))])
 
 
 @_attack("objects with descriptors at their extremes")
@@ -579,7 +585,7 @@ def _map_rings(template: Template, now_ns: int) -> list[bytes]:
 @_attack("65,535 packets announced")
 def _many_announced(template: Template, now_ns: int) -> list[bytes]:
     head = replace(template.header, count=65535, number=65534)
-    return [head.packet(*body) for body in template.own_objects()[:1]]
+    return [head.packet(*_few_objects())]
 
 
 @_attack("5,000 empty packets")
