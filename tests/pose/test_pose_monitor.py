@@ -38,6 +38,19 @@ def test_a_constant_error_within_the_prior_covariance_is_not_flagged():
         assert {PoseHealth.OFFSET, PoseHealth.DRIFTING}.isdisjoint(health) and health.count(PoseHealth.SOUND) >= 30
 
 
+def test_an_error_that_all_first_measurements_share_is_no_offset_of_an_exact_prior():
+    """Objects seen in one view err alike in every frame: a mean over frames is no more certain than one of them."""
+    prior = PosePrior.of(PRIOR.ego_from_other, 1e-4, 1e-5)
+    shared = np.array([1.6 * 0.15, 0.0, 0.0])
+    state, health = PoseMonitorState.new(), []
+    for n in range(2 * PoseMonitorConfig().min_drift_frames - 1):
+        state, report = update_monitor(state, measured(shared), prior, 0.1 * n)
+        health.append(report.health)
+    assert set(health) == {PoseHealth.SOUND}
+    _, report = update_monitor(PoseMonitorState.new(), measured(5 * shared), prior, 0.0)
+    assert report.health is PoseHealth.OFFSET
+
+
 def test_an_offset_of_five_sigma_is_flagged_in_its_first_frame():
     # 2.61 m are five sigma of the prior's 0.5 m and the measurement's 0.15 m together.
     health = [run(noise(1, s) + [0.0, 2.61, 0.0])[0].health for s in range(200)]

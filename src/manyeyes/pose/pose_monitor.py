@@ -141,8 +141,9 @@ def _report(state: PoseMonitorState, config: PoseMonitorConfig) -> PoseReport:
     weight = np.linalg.inv(state.measured_covariance[-config.offset_window :])
     joint = np.linalg.inv(weight.sum(0))
     mean = joint @ np.einsum("nab,nb->a", weight, state.innovation[-config.offset_window :])
-    if n >= max(2 * config.min_drift_frames, 3):
-        joint = joint * min((1 + correlation) / (1 - correlation), len(weight))
+    # Until it is estimated, errors of successive frames count as one: they are often those of the same objects in the same view.
+    is_known = n >= max(2 * config.min_drift_frames, 3)
+    joint = joint * (min((1 + correlation) / (1 - correlation), len(weight)) if is_known else len(weight))
     mean_distance = _distance(mean, joint + state.prior_covariance[-config.offset_window :].mean(0))
     health = PoseHealth.SUSPECT if now > config.suspect_gate else PoseHealth.SOUND
     if max(now, mean_distance) > config.offset_gate:
