@@ -102,6 +102,12 @@ def test_common_objects_far_behind_both_vehicles_are_not_taken_for_clutter(scene
     assert pose is not None and error_m(pose, made.ego_from_other) < 1.0
 
 
+@pytest.mark.parametrize("changes", [{"min_removed": 0}, {"max_variance_ratio": 0.0}, {"min_pairs": 0}])
+def test_settings_of_the_filter_are_checked(changes: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(changes))):
+        IdentityFilter(**changes)
+
+
 def test_few_boxes_that_coincide_forbid_the_identity_and_are_kept() -> None:
     spec = LandmarkSpec(8, 7, 7, REAL_BOXES, clutter=SensorClutter(5))
     ego, other, truth = observe(spec, 0)

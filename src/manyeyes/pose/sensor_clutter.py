@@ -49,8 +49,11 @@ class IdentityFilter:
     prior_sigmas: float = 2.0
 
     def __post_init__(self) -> None:
-        if min(self.max_distance_m, self.max_turn_rad, self.pose_m, self.pose_rad) <= 0 or self.min_pairs < 1:
-            raise ConfigError("IdentityFilter needs distances and angles above 0 and min_pairs >= 1.")
+        positive = self.max_distance_m, self.max_turn_rad, self.pose_m, self.pose_rad, self.max_variance_ratio
+        if min(positive) <= 0 or min(self.min_pairs, self.min_removed) < 1:
+            raise ConfigError(
+                "IdentityFilter needs distances, angles and max_variance_ratio above 0, min_pairs >= 1 and min_removed >= 1."
+            )
 
     def is_identity(self, poses: Floats) -> Bools:
         """Return (N,) bool: which poses (N, 3) are the identity."""
@@ -116,6 +119,6 @@ def _agree_elsewhere(a: Floats, b: Floats, settings: IdentityFilter) -> bool:
     if settings.is_identity(pose[None])[0]:
         return False
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    left = float(np.square(a - b @ np.array([[cos, sin], [-sin, cos]]) - pose[:2]).sum())
-    explained, dof = float(np.square(a - b).sum()) - left, 2 * len(a) - 3
-    return explained / 3 > settings.max_variance_ratio * left / dof
+    residual = float(np.square(a - b @ np.array([[cos, sin], [-sin, cos]]) - pose[:2]).sum())
+    explained, dof = float(np.square(a - b).sum()) - residual, 2 * len(a) - 3
+    return explained / 3 > settings.max_variance_ratio * residual / dof
