@@ -315,6 +315,47 @@ def test_a_sender_without_common_objects_is_propagated_from_its_last_pose() -> N
         PoseCorrection(sigma_speed_mps=0.0)
 
 
+def corrections_after(steps: Sequence[tuple[Boxes, Boxes, float]], sigma: float = 0.2) -> list[Any]:
+    """Corrections of a sender at rest; steps: the ego's boxes, the sender's boxes and the error of its prior in x."""
+    states, corrections = {}, []
+    for n, (ego_boxes, other_boxes, off) in enumerate(steps):
+        message = message_of(other_boxes, OTHERS[0], off=(off, 0.0, 0.0), sigma=sigma, time_ns=n * 100_000_000)
+        one = PoseCorrection().correct(frame(n * 100_000_000), cache_of(ego_boxes), [message], states)
+        states = one.states
+        corrections.append((one.corrections[0], pose_error(one.messages[0], OTHERS[0])[0] if one.messages else None))
+    return corrections
+
+
+def test_one_measurement_does_not_overturn_a_prior_that_the_last_corrected_pose_supports() -> None:
+    """The ego's boxes agree with the sender's at a pose 30 m away, as false boxes can."""
+    world = cars(12, 13)
+    false = shifted(world, 30.0, 5.0)
+    (alone, far), *_ = corrections_after([(false, world, 0.0)])
+    assert alone.estimate.status is PoseStatus.CONFLICT and far > 25
+    *_, (rejected, off), (after, off_after) = corrections_after(
+        [(world, world, 0.1), (false, world, 0.0), (cars(9, 2), world, 0.0)]
+    )
+    assert rejected.estimate.status is PoseStatus.AMBIGUOUS and off < 0.3
+    assert rejected.health.health is PoseHealth.SOUND and rejected.health.num_frames == 1
+    assert after.use is not MessageUse.UNCERTAIN and off_after < 0.3
+
+
+def test_a_measurement_overturns_a_prior_that_leaves_the_last_corrected_pose() -> None:
+    world = cars(12, 13)
+    *_, (jumped, off) = corrections_after([(world, world, 0.1), (world, world, 30.0)])
+    assert jumped.estimate.status is PoseStatus.CONFLICT and off < 0.1
+
+
+@pytest.mark.parametrize("sigma, is_stated", [(0.01, True), (1.2, False)])
+def test_without_common_objects_the_more_certain_of_prior_and_propagated_pose_is_used(
+    sigma: float, is_stated: bool
+) -> None:
+    world = cars(12, 13)
+    *_, (last, off) = corrections_after([(world, world, 0.0), (cars(9, 2), world, sigma)], sigma)
+    assert last.use is (MessageUse.PRIOR if is_stated else MessageUse.CORRECTED)
+    assert off == pytest.approx(sigma) if is_stated else off < 0.2
+
+
 def test_the_state_of_a_sender_that_left_expires() -> None:
     world, strange = cars(10, 12), cars(10, 11)
     messages = [message_of(world, OTHERS[0], sigma=0.2), message_of(strange, OTHERS[1], agent_id=3, sigma=0.2)]

@@ -3,10 +3,10 @@
 
 No bytes are added: the landmarks of a sender are the boxes it sends, those proposed by its tokens, or detections in its cloud, and
 its own vehicle, which other agents detect (``AgentFrame.body``). Boxes of an earlier timestamp are propagated by their velocity. A
-sender without a match is propagated from its last corrected pose: its current landmarks are matched with its earlier ones. Pairs of
-senders are matched too; a pose graph combines all matches and isolates inconsistent senders. A monitor reports senders whose prior
-poses have an offset or drift. With a FeaKM corrector, senders add descriptors of 32 bytes an object, and boxes of 14 bytes where
-they send none.
+sender without a match is propagated from its last corrected pose: its current landmarks are matched with its earlier ones. A match
+that contradicts both that pose and the prior, where these agree, is rejected. Pairs of senders are matched too; a pose graph
+combines all matches and isolates inconsistent senders. A monitor reports senders whose prior poses have an offset or drift. With a
+FeaKM corrector, senders add descriptors of 32 bytes an object, and boxes of 14 bytes where they send none.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from manyeyes.models.detector.box_head import RawBoxes
 from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.pose.feakm import FeakmNet
 from manyeyes.pose.body_estimate import BodyEstimate, append_body, update_body
-from manyeyes.pose.corrector import inflate_covariance
+from manyeyes.pose.corrector import CHI2_3DOF_P001, inflate_covariance, mahalanobis_squared
 from manyeyes.pose.feakm import FeakmCorrector
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.pose_graph import RelativePoseEdge, optimize_poses
 from manyeyes.pose.pose_monitor import PoseHealth, PoseMonitorConfig, PoseMonitorState, PoseReport, update_monitor
 from manyeyes.pose.registry import find_joint_corrector, load_corrector
-from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, lift_to_se3
+from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, lift_to_se3, no_estimate
 
 Floats = NDArray[np.float64]
 
@@ -172,7 +172,12 @@ class PoseCorrection:
         pairwise_estimates = [
             load_corrector(self.corrector)(own, theirs, prior) for theirs, prior in zip(landmarks, priors)
         ]
-        health, last_corrected = [], {a: s.last_corrected for a, s in new_states.items()}
+        last_corrected = {a: s.last_corrected for a, s in new_states.items()}
+        propagated = self._propagate_priors(frame, cache, messages, last_corrected, pairwise_estimates)
+        for n, estimate in enumerate(pairwise_estimates):
+            if n in propagated and _contradicts_both(estimate, priors[n], propagated[n]):
+                pairwise_estimates[n] = no_estimate(priors[n], PoseStatus.AMBIGUOUS)
+        health = []
         for message, prior, pairwise in zip(messages, priors, pairwise_estimates):
             before = new_states.get(message.agent_id)
             state, report = self._update_monitor(before.monitor if before else None, message, prior, pairwise)
@@ -180,27 +185,23 @@ class PoseCorrection:
             new_states.pop(message.agent_id, None)
             new_states[message.agent_id] = SenderState(state, body=bodies.get(message.agent_id))
             health.append(report)
-        propagated = set[int]()
-        for n, message in enumerate(messages):
-            last = last_corrected.get(message.agent_id)
-            propagated_prior = (
-                None
-                if last is None or pairwise_estimates[n].status.has_estimate
-                else self._propagate_prior(frame, cache, last, message)
-            )
-            if propagated_prior is not None:
-                priors[n], pairwise_estimates[n] = (
-                    propagated_prior,
-                    load_corrector(self.corrector)(own, landmarks[n], propagated_prior),
-                )
-                propagated.add(n)
+        at_propagated = set[int]()
+        for n, prior in propagated.items():
+            if pairwise_estimates[n].status.has_estimate:
+                continue
+            estimate = load_corrector(self.corrector)(own, landmarks[n], prior)
+            if _contradicts_both(estimate, priors[n], prior):
+                estimate = no_estimate(prior, PoseStatus.AMBIGUOUS)
+            if estimate.status.has_estimate or not self._supports_stated(priors[n], prior):
+                priors[n], pairwise_estimates[n] = prior, estimate
+                at_propagated.add(n)
         bodies = self._update_bodies(frame, messages, (own, *landmarks), pairwise_estimates, bodies)
         joint, inconsistent = self._optimize_jointly(messages, (own, *landmarks), priors, pairwise_estimates)
         kept, corrections = [], []
         for n, message in enumerate(messages):
             estimate = joint.get(n, pairwise_estimates[n])
             use, sigma = self._decide_use(
-                estimate, pairwise_estimates[n], n in joint or n in propagated, n in inconsistent, health[n]
+                estimate, pairwise_estimates[n], n in joint or n in at_propagated, n in inconsistent, health[n]
             )
             corrections.append(
                 CorrectionOutcome(message.agent_id, message.is_infrastructure, use, estimate, sigma, health[n])
@@ -211,7 +212,12 @@ class PoseCorrection:
                 kept.append(apply_correction(message, frame, estimate))
             # Do not propagate from a pose that conflicts with the prior: an error would persist.
             refuted = use is MessageUse.INCONSISTENT or estimate.status is PoseStatus.CONFLICT
-            put = kept[-1] if use is MessageUse.CORRECTED else last_corrected.get(message.agent_id)
+            put = last_corrected.get(message.agent_id)
+            if use is MessageUse.CORRECTED:
+                put = kept[-1]
+            elif n in propagated:
+                # The prior is not part of it: what is propagated stays independent of it.
+                put = apply_correction(message, frame, no_estimate(propagated[n]))
             new_states[message.agent_id] = replace(
                 new_states[message.agent_id],
                 last_corrected=None if refuted else put,
@@ -295,6 +301,25 @@ class PoseCorrection:
             replace(landmarks, sigma_xy=np.hypot(landmarks.sigma_xy, sigma_motion_m)) if sigma_motion_m else landmarks
         )
 
+    def _propagate_priors(
+        self,
+        frame: AgentFrame,
+        cache: PerceptionCache,
+        messages: Sequence[Message],
+        last_corrected: Mapping[int, Message | None],
+        estimates: Sequence[PoseEstimate],
+    ) -> dict[int, PosePrior]:
+        """Propagated priors, by message, of senders whose estimate does not agree with the prior."""
+        propagated = dict[int, PosePrior]()
+        for n, (message, estimate) in enumerate(zip(messages, estimates)):
+            last = last_corrected.get(message.agent_id)
+            if last is None or estimate.status in (PoseStatus.OK, PoseStatus.CORRECTED):
+                continue
+            prior = self._propagate_prior(frame, cache, last, message)
+            if prior is not None:
+                propagated[n] = prior
+        return propagated
+
     def _propagate_prior(
         self, frame: AgentFrame, cache: PerceptionCache, last: Message, message: Message
     ) -> PosePrior | None:
@@ -369,14 +394,26 @@ class PoseCorrection:
         }
         return poses, {n - 1 for n in joint.isolated}
 
+    def _supports_stated(self, stated: PosePrior | None, propagated: PosePrior) -> bool:
+        """Whether a propagated pose agrees with a prior that is more certain."""
+        return (
+            stated is not None
+            and _agree(stated, propagated)
+            and self._sigma_m(stated.covariance) <= self._sigma_m(propagated.covariance)
+        )
+
+    def _sigma_m(self, covariance: Floats) -> float:
+        """Standard deviation (m) of a position at lever_arm_m from the sender."""
+        if not np.isfinite(covariance).all():
+            return math.inf
+        variance_xy = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+        return math.sqrt(max(variance_xy + self.lever_arm_m**2 * float(covariance[2, 2]), 0.0))
+
     def _decide_use(
         self, estimate: PoseEstimate, pairwise: PoseEstimate, connected: bool, inconsistent: bool, health: PoseReport
     ) -> tuple[MessageUse, float]:
         """Use of a message with this estimate; connected: its landmarks match those of any other agent."""
-        sigma = math.inf
-        if np.isfinite(estimate.covariance).all():
-            variance_xy = np.linalg.eigvalsh(estimate.covariance[:2, :2])[-1]
-            sigma = math.sqrt(max(float(variance_xy + self.lever_arm_m**2 * estimate.covariance[2, 2]), 0.0))
+        sigma = self._sigma_m(estimate.covariance)
         has_estimate = connected or pairwise.status.has_estimate
         is_faulty = not has_estimate and health.health in _FAULTY
         if inconsistent:
@@ -413,6 +450,22 @@ def apply_correction(message: Message, frame: AgentFrame, estimate: PoseEstimate
 def _make_prior(one: AgentFrame | Message, other: Message) -> PosePrior | None:
     """Return the prior of two agents' reported poses; None if a pose is unknown."""
     return PosePrior.between(one, other) if has_known_pose(one) and has_known_pose(other) else None
+
+
+def _agree(one: PosePrior, other: PosePrior) -> bool:
+    """Whether two priors of one pose agree at p = 0.001."""
+    return mahalanobis_squared(one.pose, one.covariance, other) <= CHI2_3DOF_P001
+
+
+def _contradicts_both(estimate: PoseEstimate, prior: PosePrior | None, propagated: PosePrior) -> bool:
+    """Whether a measured pose contradicts the prior and the propagated pose, which agree with each other."""
+    if estimate.measured is None or estimate.measured_covariance is None or prior is None:
+        return False
+    is_refuted = (
+        mahalanobis_squared(estimate.measured, estimate.measured_covariance, other) > CHI2_3DOF_P001
+        for other in (prior, propagated)
+    )
+    return _agree(prior, propagated) and all(is_refuted)
 
 
 def _make_edge(i: int, j: int, estimate: PoseEstimate) -> RelativePoseEdge | None:
