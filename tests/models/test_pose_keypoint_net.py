@@ -7,12 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from manyeyes.datatypes import BevGrid, Boxes, ShapeError, SparseBev, Transform
+from manyeyes.datatypes import BevGrid, Boxes, ConfigError, ShapeError, SparseBev, Transform
 from manyeyes.models.detector.box_head import BOX_LAYOUT
 from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.fusion.transform_tokens import rotate_vectors
 from manyeyes.models.pose.box_descriptors import BoxKeypointConfig, BoxKeypointNet
 from manyeyes.models.pose.keypoint_net import DenseKeypointConfig, DenseKeypointNet, DetectorView, local_maxima
+from manyeyes.models.pose.peak_descriptors import PeakKeypointConfig, PeakKeypointNet
 
 GRID = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0, stride=2)
 CHANNELS = 8
@@ -34,6 +35,11 @@ def dense(**more) -> DenseKeypointNet:
 def boxed(**more) -> BoxKeypointNet:
     torch.manual_seed(0)
     return BoxKeypointNet(BoxKeypointConfig(CHANNELS, 16, 32, **more)).eval().requires_grad_(False)
+
+
+def peaked(**more) -> PeakKeypointNet:
+    torch.manual_seed(0)
+    return PeakKeypointNet(PeakKeypointConfig(CHANNELS, 16, 32, **more)).eval().requires_grad_(False)
 
 
 def test_the_number_of_weights_is_that_of_the_published_extractor():
@@ -84,28 +90,62 @@ def test_published_descriptor_depends_on_the_other_agent_and_improved_one_does_n
     assert len(mended([loud])[0]) == 0
 
 
-def test_improved_descriptor_is_invariant_to_agent_rotation():
-    """A quarter turn maps cells of a square lattice onto cells: tokens, their vectors and boxes turn, descriptors stay."""
+def quarter_turn(cells: int) -> tuple[DetectorView, DetectorView]:
+    """One random view from before and after a quarter turn of its agent, which maps cells of a square lattice onto cells."""
     shift = 25.4  # centres lie at -25.4 + 0.8 k; a quarter turn about the middle of the lattice keeps them
     grid = BevGrid(-25.6, -25.6, -3.0, 25.6, 25.6, 5.0, stride=1)
+    assert shift == pytest.approx(-float(grid.centers(torch.tensor([[0, 0]]))[0, 0]))
     rng = torch.Generator().manual_seed(3)
-    flat = torch.randperm(grid.shape[0] * grid.shape[1], generator=rng)[:6000]
+    flat = torch.randperm(grid.shape[0] * grid.shape[1], generator=rng)[:cells]
     yx = torch.stack((flat // grid.shape[1], flat % grid.shape[1]), 1)
     features = torch.randn(len(yx), CHANNELS, generator=rng)
     boxes = Boxes.of(
         (torch.rand(5, 3, generator=rng) - 0.5) * 30, 1 + torch.rand(5, 3, generator=rng), torch.rand(5, generator=rng)
     )
-    quarter = torch.tensor(math.pi / 2)
     turned_yx = torch.stack((yx[:, 1], grid.shape[0] - 1 - yx[:, 0]), 1)
     tokens = SparseBev.from_cells(features, yx, grid)
-    turned = SparseBev.from_cells(rotate_vectors(features, quarter), turned_yx, grid)
-    assert shift == pytest.approx(-float(grid.centers(torch.tensor([[0, 0]]))[0, 0]))
+    turned = SparseBev.from_cells(rotate_vectors(features, torch.tensor(math.pi / 2)), turned_yx, grid)
     move = Transform.from_xyz_yaw(0.0, 0.0, 0.0, math.pi / 2)
-    (here,) = boxed()([DetectorView(tokens, torch.ones(len(yx)), boxes)])
-    (there,) = boxed()([DetectorView(turned, torch.ones(len(yx)), boxes.transform(move))])
+    return DetectorView(tokens, torch.ones(cells), boxes), DetectorView(
+        turned, torch.ones(cells), boxes.transform(move)
+    )
+
+
+def test_improved_descriptor_is_invariant_to_agent_rotation():
+    """Tokens, their vectors and boxes turn, descriptors stay."""
+    before, after = quarter_turn(6000)
+    (here,), (there,) = boxed()([before]), boxed()([after])
     torch.testing.assert_close(there.descriptor, here.descriptor, atol=1e-4, rtol=1e-4)
-    (unturned,) = boxed()([DetectorView(tokens, torch.ones(len(yx)), boxes.transform(move))])
+    (unturned,) = boxed()([replace(before, boxes=after.boxes)])
     assert float((unturned.descriptor - here.descriptor).norm(dim=1).min()) > 1e-2
+
+
+def test_peaks_of_features_are_invariant_to_agent_rotation():
+    """Peaks turn with the agent, their axes too, and descriptors stay; boxes and confidence have no effect."""
+    before, after = quarter_turn(600)
+    (here,), (there,) = peaked()([before]), peaked()([after])
+    turned = here.transform(Transform.from_xyz_yaw(0.0, 0.0, 0.0, math.pi / 2))
+    assert len(here) == 64
+    torch.testing.assert_close(there.xy, turned.xy.float(), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(there.descriptor, here.descriptor, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close((2 * there.boxes.yaw).cos(), (2 * turned.boxes.yaw).cos(), atol=1e-3, rtol=1e-3)
+    (other,) = peaked()([DetectorView(before.tokens, torch.zeros(600), Boxes.empty())])
+    assert torch.equal(other.descriptor, here.descriptor)
+
+
+def test_peaks_are_the_largest_norms_and_their_axis_is_that_of_the_cells():
+    """A wall along x with its highest norm in the middle, and a weaker cell apart."""
+    cells = [(32, c) for c in range(28, 37)] + [(50, 50)]
+    features = torch.zeros(len(cells), CHANNELS)
+    features[:, 0] = torch.tensor([1.0, 1, 1, 1, 9, 1, 1, 1, 1, 5])
+    tokens = SparseBev.from_cells(features, torch.tensor(cells), GRID)
+    (points,) = peaked(nms_radius_m=8.0)([DetectorView(tokens, torch.zeros(len(cells)), Boxes.empty())])
+    torch.testing.assert_close(points.xy, GRID.centers(torch.tensor([(32, 32), (50, 50)])).float())
+    assert float(points.boxes.yaw[0]) == pytest.approx(0.0, abs=1e-5) and points.boxes.size.eq(0).all()
+    nothing = SparseBev.from_cells(torch.zeros(0, CHANNELS), torch.zeros(0, 2, dtype=torch.int64), GRID)
+    assert len(peaked()([DetectorView(nothing, torch.zeros(0), Boxes.empty())])[0]) == 0
+    with pytest.raises(ConfigError, match="nms_radius_m"):
+        PeakKeypointConfig(nms_radius_m=0.0)
 
 
 def test_improved_keypoints_are_the_best_boxes():

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -17,6 +17,7 @@ from manyeyes.models.pose.box_descriptors import BoxKeypointConfig, BoxKeypointN
 from manyeyes.models.pose.keypoint_net import DenseKeypointConfig, DenseKeypointNet, DetectorView
 from manyeyes.models.pose.matcher import Assignment, KeypointBatch, Matcher, MatcherConfig, find_mutual_matches
 from manyeyes.models.pose.neighbour_geometry import NeighbourGeometryConfig
+from manyeyes.models.pose.peak_descriptors import PeakKeypointConfig, PeakKeypointNet
 
 FORMAT = "manyeyes-feakm-1"
 
@@ -28,7 +29,7 @@ class FeakmConfig:
     detector: fingerprint (hex) of the detector whose views the network was trained on; empty accepts any.
     """
 
-    keypoints: DenseKeypointConfig | BoxKeypointConfig
+    keypoints: DenseKeypointConfig | BoxKeypointConfig | PeakKeypointConfig
     matcher: MatcherConfig
     detector: str = ""
 
@@ -47,8 +48,7 @@ class FeakmNet(nn.Module):
     def __init__(self, config: FeakmConfig) -> None:
         super().__init__()
         self.config = config
-        kind = config.keypoints
-        self.keypoints = DenseKeypointNet(kind) if isinstance(kind, DenseKeypointConfig) else BoxKeypointNet(kind)
+        self.keypoints = _make_keypoint_net(config.keypoints)
         self.matcher = Matcher(config.matcher)
 
     @property
@@ -90,6 +90,14 @@ class FeakmNet(nn.Module):
             )
 
 
+def _make_keypoint_net(
+    config: DenseKeypointConfig | BoxKeypointConfig | PeakKeypointConfig,
+) -> DenseKeypointNet | BoxKeypointNet | PeakKeypointNet:
+    if isinstance(config, DenseKeypointConfig):
+        return DenseKeypointNet(config)
+    return BoxKeypointNet(config) if isinstance(config, BoxKeypointConfig) else PeakKeypointNet(config)
+
+
 FEAKM_PAPER = FeakmConfig(DenseKeypointConfig(), MatcherConfig())
 """As published: 15 M parameters with its 128 input channels."""
 
@@ -107,7 +115,10 @@ FEAKM_SMALL = FeakmConfig(
 )
 """The improved variant, at most 2 M parameters."""
 
-FEAKM = {"feakm-paper": FEAKM_PAPER, "feakm-small": FEAKM_SMALL}
+FEAKM_PEAKS = replace(FEAKM_SMALL, keypoints=PeakKeypointConfig())
+"""The improved variant without a confidence map, for Table 3."""
+
+FEAKM = {"feakm-paper": FEAKM_PAPER, "feakm-small": FEAKM_SMALL, "feakm-peaks": FEAKM_PEAKS}
 
 
 def load(path: Path) -> FeakmNet:

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from manyeyes.datatypes import ConfigError, Transform
 from manyeyes.datatypes.keypoints import Keypoints
-from manyeyes.models.pose.feakm import FEAKM_PAPER, FEAKM_SMALL, FORMAT, FeakmConfig, FeakmNet
+from manyeyes.models.pose.feakm import FEAKM_PAPER, FEAKM_PEAKS, FEAKM_SMALL, FORMAT, FeakmConfig, FeakmNet
 from manyeyes.models.pose.keypoint_net import DetectorView
 from manyeyes.models.pose.matcher import Assignment, KeypointBatch, find_mutual_matches
 from manyeyes.ops.keyed_random import keyed_generator
@@ -78,19 +78,23 @@ class FeakmTrainConfig(TrainConfig):
             )
 
 
+_SMALL = FeakmTrainConfig(
+    FEAKM_SMALL,
+    steps=6000,
+    batch=16,
+    learning_rate=1e-3,
+    match_radius_m=1.5,
+    unmatched_radius_m=2.4,
+    augment=KeypointAugmentConfig(),
+)
 FEAKM_TRAINING_PRESETS: dict[str, FeakmTrainConfig] = {
-    "feakm-small": FeakmTrainConfig(
-        FEAKM_SMALL,
-        steps=6000,
-        batch=16,
-        learning_rate=1e-3,
-        match_radius_m=1.5,
-        unmatched_radius_m=2.4,
-        augment=KeypointAugmentConfig(),
-    ),
+    "feakm-small": _SMALL,
+    "feakm-peaks": replace(_SMALL, net=FEAKM_PEAKS),
     "feakm-paper": FeakmTrainConfig(FEAKM_PAPER, steps=15000, batch=16, learning_rate=2e-4, weight_decay=0.0),
 }
-"""feakm-small: the shipped weights. feakm-paper: 15 M parameters, as published but for the schedule's shape."""
+"""feakm-small: the shipped weights. feakm-peaks: the same without a confidence map. feakm-paper: 15 M parameters, as published but
+for the schedule's shape.
+"""
 
 
 @dataclass(frozen=True, eq=False)
