@@ -70,7 +70,7 @@ def test_a_recording_is_described(tmp_path, weights, capsys):
     root = write(tmp_path)
     code, text = run(capsys, "check", root, "--weights", weights, "--out", tmp_path / "check.json")
     assert code == 0
-    for word in ("1 scenarios, 3 snapshots", "no file is missing", "labels: 2 car", "0 of 4", "roadside units: points"):
+    for word in ("1 scenario, 3 snapshots", "no file is missing", "labels: 2 car", "0 of 4", "roadside units: points"):
         assert word in text
     assert "period [s] 0.100" in text and "trained on 200 to 300" in text and "manyeyes finetune" in text
     assert json.loads((tmp_path / "check.json").read_text())["result"]["check"]["num_listed"] == 4

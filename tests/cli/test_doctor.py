@@ -61,3 +61,8 @@ def test_loops_are_compiled_instead_of_the_diagnosis(
     assert cli.main(["doctor", "--compile"]) == 0
     out = capsys.readouterr().out
     assert wanted in out and "versions" not in out
+
+
+def test_compiling_has_no_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["doctor", "--compile", "--json"]) == 1
+    assert "--json is the form of the diagnosis" in capsys.readouterr().err

@@ -67,7 +67,9 @@ def main(options: Options) -> None:
 
 def _describe(found: RecordingCheck, missing: MissingFiles, summary: tuple[str, ...]) -> Iterator[str]:
     """Yield what the recording is and lacks."""
-    yield f"{found.num_scenarios:,} scenarios, {found.num_snapshots:,} snapshots; {found.num_read} of them read"
+    counts = (found.num_scenarios, "scenario"), (found.num_snapshots, "snapshot")
+    held = ", ".join(f"{count:,} {name}{'' if count == 1 else 's'}" for count, name in counts)
+    yield f"{held}; {found.num_read} of them read"
     yield from summary
     yield f"missing or mismatched files: {missing.count:,}" if missing.count else "no file is missing"
     yield from (str(problem) for problem in missing.files[:_MAX_LINES])

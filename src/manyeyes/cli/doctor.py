@@ -142,8 +142,10 @@ def main(options: Options) -> None:
     """Print the diagnosis of this installation, or compile loops ahead.
 
     Raises:
-        CheckpointError: shipped weights are missing or damaged; the diagnosis is printed before.
+        CheckpointError: shipped weights are missing or damaged; the diagnosis is printed before. ConfigError: both options.
     """
+    if options.compile and options.json:
+        raise ConfigError("--json is the form of the diagnosis; leave it out with --compile.")
     if options.compile:
         _compile_ahead(Console())
         return
