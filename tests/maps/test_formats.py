@@ -114,6 +114,11 @@ def test_geopandas_reads_all_elements_in_their_place_on_earth(two_lanes, tmp_pat
     assert first.supporters == 2 and first.confidence == pytest.approx(1 / (1 + np.exp(-m.log_odds[1])), abs=1e-6)
 
 
+QGIS_STYLE_QUERY = """SELECT f_table_catalog, f_table_schema, f_table_name, f_geometry_column, styleName, styleQML, styleSLD,
+useAsDefault, description, owner, ui, update_time FROM layer_styles WHERE f_table_schema = '' AND f_table_name = 'lines'
+AND f_geometry_column = 'geom' ORDER BY CASE WHEN useAsDefault THEN 1 ELSE 2 END, update_time DESC LIMIT 1"""
+
+
 @pytest.mark.parametrize("crs", ["EPSG:25832", "local"])
 def test_a_geopackage_in_metres_holds_the_same_places_with_a_style_of_each_layer(two_lanes, tmp_path, crs):
     geopandas = pytest.importorskip("geopandas", reason="the map extra is not installed")
@@ -133,6 +138,8 @@ def test_a_geopackage_in_metres_holds_the_same_places_with_a_style_of_each_layer
         styles = dict(data.execute("SELECT f_table_name, styleQML FROM layer_styles WHERE useAsDefault = 1").fetchall())
         (kind,) = data.execute("SELECT data_type FROM gpkg_contents WHERE table_name = 'layer_styles'").fetchone()
         columns = dict(data.execute("SELECT table_name, column_name FROM gpkg_geometry_columns").fetchall())
+        # QGIS's own query of a layer's styles: an unknown column fails it, and the layer stays grey.
+        data.execute(QGIS_STYLE_QUERY).fetchall()
     assert kind == "attributes" and set(columns.values()) == {"geom"}
     for layer, kinds in (("lines", {"divider", "boundary", "stop_line"}), ("crossings", {"crossing"})):
         root = ET.fromstring(styles[layer])

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Styles inside a GeoPackage: the table ``layer_styles``, out of which QGIS loads the default style of a layer (QML).
 
-Source: QGIS documentation, "Save and Load Layer Styles" (style in the data source), for the columns of the table.
+The name and the columns of the table are those by which QGIS (3.22) finds a style; it skips a table without one of them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _WIDTH_MM = {"divider": 0.5, "boundary": 0.8, "stop_line": 1.0}
 _LAYER_KINDS = {"lines": ("divider", "boundary", "stop_line"), "crossings": ("crossing",)}
 _CREATE = f"""CREATE TABLE {TABLE} (id INTEGER PRIMARY KEY AUTOINCREMENT, f_table_catalog TEXT(256), f_table_schema TEXT(256),
 f_table_name TEXT(256), f_geometry_column TEXT(256), styleName TEXT(30), styleQML TEXT, styleSLD TEXT, useAsDefault BOOLEAN,
-description TEXT, owner TEXT(30), ui TEXT(30), update_datetime DATETIME)"""
+description TEXT, owner TEXT(30), ui TEXT(30), update_time DATETIME DEFAULT CURRENT_TIMESTAMP)"""
 
 
 def write_styles(path: Path, layers: Sequence[str], date: str) -> None:
