@@ -32,11 +32,12 @@ from manyeyes.models.detector.box_head import RawBoxes
 from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.pose.feakm import FeakmNet
 from manyeyes.pose.body_estimate import BodyEstimate, append_body, update_body
-from manyeyes.pose.corrector import CHI2_3DOF_P001, inflate_covariance, mahalanobis_squared
+from manyeyes.pose.corrector import inflate_covariance
 from manyeyes.pose.feakm import FeakmCorrector
 from manyeyes.pose.landmarks import Landmarks
 from manyeyes.pose.pose_graph import RelativePoseEdge, optimize_poses
 from manyeyes.pose.pose_monitor import PoseHealth, PoseMonitorConfig, PoseMonitorState, PoseReport, update_monitor
+from manyeyes.pose.propagated_prior import contradicts_both, priors_agree, propagate_prior
 from manyeyes.pose.registry import find_joint_corrector, load_corrector
 from manyeyes.pose.types import PoseEstimate, PosePrior, PoseStatus, lift_to_se3, no_estimate
 
@@ -175,7 +176,7 @@ class PoseCorrection:
         last_corrected = {a: s.last_corrected for a, s in new_states.items()}
         propagated = self._propagate_priors(frame, cache, messages, last_corrected, pairwise_estimates)
         for n, estimate in enumerate(pairwise_estimates):
-            if n in propagated and _contradicts_both(estimate, priors[n], propagated[n]):
+            if n in propagated and contradicts_both(estimate, priors[n], propagated[n]):
                 pairwise_estimates[n] = no_estimate(priors[n], PoseStatus.AMBIGUOUS)
         health = []
         for message, prior, pairwise in zip(messages, priors, pairwise_estimates):
@@ -190,7 +191,7 @@ class PoseCorrection:
             if pairwise_estimates[n].status.has_estimate:
                 continue
             estimate = load_corrector(self.corrector)(own, landmarks[n], prior)
-            if _contradicts_both(estimate, priors[n], prior):
+            if contradicts_both(estimate, priors[n], prior):
                 estimate = no_estimate(prior, PoseStatus.AMBIGUOUS)
             if estimate.status.has_estimate or not self._supports_stated(priors[n], prior):
                 priors[n], pairwise_estimates[n] = prior, estimate
@@ -332,15 +333,7 @@ class PoseCorrection:
         then, now = self._message_landmarks(cache, last, seconds), self._message_landmarks(cache, message, 0.0)
         sigma_motion = np.array([self.sigma_speed_mps, self.sigma_speed_mps, self.sigma_yaw_rate_rps]) * seconds
         motion = load_corrector(self.corrector)(then, now, PosePrior(Transform.identity(), np.diag(sigma_motion**2)))
-        if not motion.status.has_estimate or motion.ego_from_other is None:
-            return None
-        previous = PosePrior.between(frame, last)
-        x, y = (previous.ego_from_other.rotation[:2, :2] @ motion.ego_from_other.translation[:2]).tolist()
-        lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
-        turn = np.eye(3)
-        turn[:2, :2] = previous.ego_from_other.rotation[:2, :2].numpy()
-        covariance = lever @ previous.covariance @ lever.T + turn @ motion.covariance @ turn.T
-        return PosePrior(previous.ego_from_other @ motion.ego_from_other, (covariance + covariance.T) / 2)
+        return propagate_prior(PosePrior.between(frame, last), motion)
 
     def _update_monitor(
         self, state: PoseMonitorState | None, message: Message, prior: PosePrior | None, estimate: PoseEstimate
@@ -398,7 +391,7 @@ class PoseCorrection:
         """Whether a propagated pose agrees with a prior that is more certain."""
         return (
             stated is not None
-            and _agree(stated, propagated)
+            and priors_agree(stated, propagated)
             and self._sigma_m(stated.covariance) <= self._sigma_m(propagated.covariance)
         )
 
@@ -450,22 +443,6 @@ def apply_correction(message: Message, frame: AgentFrame, estimate: PoseEstimate
 def _make_prior(one: AgentFrame | Message, other: Message) -> PosePrior | None:
     """Return the prior of two agents' reported poses; None if a pose is unknown."""
     return PosePrior.between(one, other) if has_known_pose(one) and has_known_pose(other) else None
-
-
-def _agree(one: PosePrior, other: PosePrior) -> bool:
-    """Whether two priors of one pose agree at p = 0.001."""
-    return mahalanobis_squared(one.pose, one.covariance, other) <= CHI2_3DOF_P001
-
-
-def _contradicts_both(estimate: PoseEstimate, prior: PosePrior | None, propagated: PosePrior) -> bool:
-    """Whether a measured pose contradicts the prior and the propagated pose, which agree with each other."""
-    if estimate.measured is None or estimate.measured_covariance is None or prior is None:
-        return False
-    is_refuted = (
-        mahalanobis_squared(estimate.measured, estimate.measured_covariance, other) > CHI2_3DOF_P001
-        for other in (prior, propagated)
-    )
-    return _agree(prior, propagated) and all(is_refuted)
 
 
 def _make_edge(i: int, j: int, estimate: PoseEstimate) -> RelativePoseEdge | None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from manyeyes._bounds import OutputFile, PositiveInt
+from manyeyes._text import count_noun
 
 if TYPE_CHECKING:
     from manyeyes.datasets.missing import MissingFiles
@@ -67,9 +68,10 @@ def main(options: Options) -> None:
 
 def _describe(found: RecordingCheck, missing: MissingFiles, summary: tuple[str, ...]) -> Iterator[str]:
     """Yield what the recording is and lacks."""
-    counts = (found.num_scenarios, "scenario"), (found.num_snapshots, "snapshot")
-    held = ", ".join(f"{count:,} {name}{'' if count == 1 else 's'}" for count, name in counts)
-    yield f"{held}; {found.num_read} of them read"
+    yield (
+        f"{count_noun(found.num_scenarios, 'scenario')}, {count_noun(found.num_snapshots, 'snapshot')}; "
+        f"{found.num_read} of them read"
+    )
     yield from summary
     yield f"missing or mismatched files: {missing.count:,}" if missing.count else "no file is missing"
     yield from (str(problem) for problem in missing.files[:_MAX_LINES])

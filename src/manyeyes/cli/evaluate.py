@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from manyeyes._bounds import AngleDeg, LengthM, NonNegativeInt, OutputFolder
+from manyeyes._text import count_noun
 from manyeyes.studies.options import EvaluationOptions
 from manyeyes.studies.replay_options import display_name, make_excerpt
 
@@ -98,7 +99,8 @@ def _evaluate(options: Options) -> None:
     seed = read_training_seed(options.replay_options.weights)
     comparison = summarize_comparison(timed_results, protocol, missing, seed)
     data_name = f"{options.data.name}{f'/{options.split}' if options.split else ''}"
-    title = f"{display_name(options.replay_options.weights)} on {data_name}: {num_scenarios} scenarios, {protocol.name}"
+    held = count_noun(num_scenarios, "scenario")
+    title = f"{display_name(options.replay_options.weights)} on {data_name}: {held}, {protocol.name}"
     note = "" if noise is None else errors.describe(options.seed)
     print_comparison(console, comparison, title)
     if note:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from manyeyes._bounds import InputPath, OutputFolder, Seed, WorkerCount
+from manyeyes._text import count_noun
 
 
 @dataclass(frozen=True)
@@ -70,5 +71,7 @@ def main(options: Options) -> None:
         options.seed,
     )
     console.print(
-        f"{len(held)} scenarios in {out}; {manifest} lists counts and hashes", highlight=False, soft_wrap=True
+        f"{count_noun(len(held), 'scenario')} in {out}; {manifest} lists counts and hashes",
+        highlight=False,
+        soft_wrap=True,
     )

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from manyeyes._io import atomic_rename, flush_files
+from manyeyes._text import count_noun
 from manyeyes.datasets.dair_v2x.index import find_dair_root
 from manyeyes.datasets.manifest import (
     BATCHES,
@@ -98,7 +99,7 @@ def require_own_folder(state: FolderState, finished: Mapping[str, Mapping[str, A
     foreign = _foreign_scenarios(root, plan, finished) if same_run else []
     if foreign:
         raise ConfigError(
-            f"{root} holds {_count(len(foreign), 'scenario folder')} that no run of 'manyeyes simulate' for this layout "
+            f"{root} holds {count_noun(len(foreign), 'scenario folder')} that no run of 'manyeyes simulate' for this layout "
             f"wrote, the first is {foreign[0]}. {_UNCHANGED}"
         )
     other = [place for place, asked in finished.items() if plan.requested_specs.get(place) != asked]
@@ -110,7 +111,7 @@ def require_own_folder(state: FolderState, finished: Mapping[str, Mapping[str, A
     why = f" ({_difference(other[0], finished, plan)})" if same_run and other else ""
     count = len(list(root.glob(f"*/*/{SCENARIO}"))) + len(list(root.glob(f"{BATCHES}/*.json")))
     raise ConfigError(
-        f"{root} holds {_count(count, 'finished scenario')} {there}; this run makes {len(plan.names)} "
+        f"{root} holds {count_noun(count, 'finished scenario')} {there}; this run makes {len(plan.names)} "
         f"{_describe(wanted)}{why}. {_UNCHANGED}"
     )
 
@@ -164,10 +165,6 @@ def _flat(asked: Mapping[str, Any]) -> dict[str, Any]:
     for name, value in asked.items():
         flat.update(value if isinstance(value, dict) else {name: value})
     return flat
-
-
-def _count(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 @dataclass(frozen=True)

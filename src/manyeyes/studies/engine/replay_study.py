@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+from manyeyes._text import count_noun
 from manyeyes.agents.strategies.names import TEMPORAL
 from manyeyes.agents.strategies.registry import get_strategy, list_strategies
 from manyeyes.datasets.base import RecordingReader
@@ -58,7 +59,7 @@ class ReplayStudy:
         assert isinstance(options, RecordingStudyOptions)
         frames = sum(len(recording.eval_indices(name)) for name in recording.scenarios)
         data_name = f"{options.data.name}{f'/{options.split}' if options.split else ''}"
-        size = f"{len(recording.scenarios)} scenarios, {frames} frames"
+        size = f"{count_noun(len(recording.scenarios), 'scenario')}, {count_noun(frames, 'frame')}"
         class_name = f", {self.object_class}" if self.object_class else ""
         return f"{display_name(str(self.base.weights))} on {data_name}: {size}{class_name}"
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from manyeyes._text import count_noun
 from manyeyes.datasets.base import Recording
 from manyeyes.datasets.registry import open_recording
 from manyeyes.datatypes import ConfigError
@@ -70,7 +71,8 @@ class MapModelStudy:
         options = self.options
         scenarios = self.models[0].source.open_recording().scenarios[:: options.scenario_stride]
         names = ", ".join(Path(model.weights).stem for model in self.models)
-        return f"{names} on {options.data.name}/{options.split}: {len(scenarios)} scenarios, {options.seeds} seeds"
+        held = count_noun(len(scenarios), "scenario")
+        return f"{names} on {options.data.name}/{options.split}: {held}, {count_noun(options.seeds, 'seed')}"
 
     def predict_tables(self, predictor: TilePredictor) -> dict[str, TileTable]:
         """Predict the tiles of each model, by its sensors."""
