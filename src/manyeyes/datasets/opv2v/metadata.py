@@ -230,10 +230,9 @@ def _numbers(path: Path, content: Mapping[Any, Any], key: str, count: int, yaml_
 def _label(vehicle: Mapping[Any, Any], size: np.ndarray) -> int:
     """Return index into LABELS: by name where the file has one, else by size; -1 of a type that is none of them.
 
-    OPV2V names no class. Our writer and real recordings have ``obj_type``; some releases have CARLA's blueprint as ``bp_id``.
-    The sizes
-    part CARLA's own vehicles: buses from 9 m, trucks from 6.5 m or as wide and high as its 5.2 m delivery truck, vans
-    from 2 m height. A high pick-up counts as a van.
+    OPV2V names no class. Our writer and real recordings have ``obj_type``; some releases have CARLA's blueprint as ``bp_id``. The
+    sizes part CARLA's own vehicles: buses from 9 m, trucks from 6.5 m or as wide and high as its 5.2 m delivery truck, vans from 2
+    m height. A high pick-up counts as a van.
     """
     stated = str(vehicle.get("obj_type", "")).lower()
     if stated:

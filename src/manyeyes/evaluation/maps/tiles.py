@@ -2,9 +2,8 @@
 """Tiles of a drive: their places, the frames that observe them, and their ground truth.
 
 A tile is evaluated against all elements of the true map within it, observed or not, since collaboration is to recover what one
-vehicle cannot see. Training leaves out elements that no frame observed (training.maps.targets), to avoid false positives.
-Lines are cut at the tile's border,
-rings too, and stay rings; parts of lines below 2 m and of rings below 3 m² are no elements.
+vehicle cannot see. Training leaves out elements that no frame observed (training.maps.targets), to avoid false positives. Lines are
+cut at the tile's border, rings too, and stay rings; parts of lines below 2 m and of rings below 3 m² are no elements.
 """
 
 from __future__ import annotations

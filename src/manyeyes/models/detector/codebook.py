@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Encode tokens in a few bytes: features by residual vector quantisation, proposals by fixed rules.
 
-Each stage stores in one byte the index of the nearest centre to the residual of the stages before (Juang and Gray,
-ICASSP 1982). The
-centres are fitted to tokens of training scenes (``training/detector/codebook.py``) and are part of the weights. The
-detector's
+Each stage stores in one byte the index of the nearest centre to the residual of the stages before (Juang and Gray, ICASSP 1982).
+The centres are fitted to tokens of training scenes (``training/detector/codebook.py``) and are part of the weights. The detector's
 fingerprint covers them, so sender and receiver decode a byte alike.
 """
 

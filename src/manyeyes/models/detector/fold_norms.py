@@ -33,9 +33,8 @@ def fold_norms(model: Detector, in_bfloat16: bool = False) -> Detector:
 
     Outputs are equal and inference is faster. in_bfloat16: convolutions of the encoder and linear layers of attention blocks
     multiply bfloat16 with float32 sums where the processor has such products; then outputs differ by its rounding. Norms, softmax
-    and heads stay in float32. Configuration and fingerprint are kept, so that messages of the
-    original model can be
-    decoded. The copy cannot be saved or trained.
+    and heads stay in float32. Configuration and fingerprint are kept, so that messages of the original model can be decoded. The
+    copy cannot be saved or trained.
     """
     copied = copy.deepcopy(model).eval().requires_grad_(False)
     # Parts before what they are part of.

@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The predicted box of each token, which a change of frame transforms exactly.
 
-A learned feature is relative to its sender's frame, and the receiver can rotate only its vector channels. A proposal
-holds the
-outputs of the sender's own head (every agent perceives as ego before it shares, CoSTr section III-A), and a rigid
-motion of a box is
-exact.
+A learned feature is relative to its sender's frame, and the receiver can rotate only its vector channels. A proposal holds the
+outputs of the sender's own head (every agent perceives as ego before it shares, CoSTr section III-A), and a rigid motion of a box
+is exact.
 """
 
 from __future__ import annotations

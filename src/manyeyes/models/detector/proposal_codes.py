@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Encode proposals in bytes: each quantity by a fixed rule of one byte, equal for all weights.
 
-The quantisation error is at most half a step: 1.4 cm in x and y at a cell of 1.6 m, 2 cm in z, 0.35 degrees, 0.63 %
-of each size,
-0.125 m/s; the sigmas within 22 %. Values beyond 127 steps saturate. The heading logit is stored along the box axis.
-Of the class
+The quantisation error is at most half a step: 1.4 cm in x and y at a cell of 1.6 m, 2 cm in z, 0.35 degrees, 0.63 % of each size,
+0.125 m/s; the sigmas within 22 %. Values beyond 127 steps saturate. The heading logit is stored along the box axis. Of the class
 logits, the best and its lead are stored. The length of ``axis`` is not sent; it is 1 for a confident head.
 """
 

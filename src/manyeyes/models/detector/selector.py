@@ -14,8 +14,7 @@ from manyeyes.models.fusion.token_merge import PROPOSAL_SCALE, target_cell_keys
 class Selector(nn.Module):
     """The mask of Eq. 12 as a function of each token: m = sigmoid(score).
 
-    The score starts as the heatmap logit of the token minus a penalty for redundancy, which counts the sender's own
-    higher-scored
+    The score starts as the heatmap logit of the token minus a penalty for redundancy, which counts the sender's own higher-scored
     tokens that propose the same cell. A learned function of the token is added.
     """
 

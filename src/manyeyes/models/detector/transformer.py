@@ -54,9 +54,8 @@ class AttentionConfig:
 class WindowBlock(nn.Module):
     """Pre-norm attention within a window and a feed-forward network, both residual (Eq. 6, 7).
 
-    The relative position encoding (Eq. 4) enters queries and keys, measured from the centre of the regular or shifted
-    window. Padding is
-    internal to ``ops``.
+    The relative position encoding (Eq. 4) enters queries and keys, measured from the centre of the regular or shifted window.
+    Padding is internal to ``ops``.
     """
 
     def __init__(self, channels: int, config: AttentionConfig, shifted: bool) -> None:

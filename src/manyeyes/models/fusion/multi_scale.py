@@ -23,10 +23,9 @@ from manyeyes.ops.voxelize import segment_max
 class MultiScaleFusion(nn.Module):
     """Maximum over agents at the token stride and at multiples of it, concatenated and projected.
 
-    Eq. 7a downsamples each agent's map and Eq. 7b fuses them. One maximum over a coarse cell does both, because the
-    maximum over agents
-    of per-agent maxima is the maximum over all tokens. Initialised to equal MaxFusion: coarser scales have weight
-    zero. It has no attention.
+    Eq. 7a downsamples each agent's map and Eq. 7b fuses them. One maximum over a coarse cell does both, because the maximum over
+    agents of per-agent maxima is the maximum over all tokens. Initialised to equal MaxFusion: coarser scales have weight zero. It
+    has no attention.
     """
 
     def __init__(self, channels: int, attention: AttentionConfig | None = None, levels: int = 3) -> None:

@@ -19,8 +19,7 @@ FRAME_CONTEXT_DIM = 3
 class SpatioTemporalEncoding(nn.Module):
     """Encode position in the cell, sender frame, position sigma, age and proposal, and add them to a feature.
 
-    The age also enters as sines and cosines (Eq. 9, exponent with floor(k / 2), unit 100 ms). Both branches end in
-    zero-initialised
+    The age also enters as sines and cosines (Eq. 9, exponent with floor(k / 2), unit 100 ms). Both branches end in zero-initialised
     layers, so that training starts without encoding.
     """
 

@@ -3,9 +3,8 @@
 
 Peaks of the ego's and of a sender's tokens are proposed centres of objects. Pairs of them vote for a displacement; the pairs of its
 mode give position and yaw in closed form: least squares with a Gaussian prior, so that few pairs move little. Nothing is moved
-without enough pairs, with a second mode of almost as many votes, or where chi2 is below a low limit, so that estimates near
-their own error do move tokens. Headings of
-proposals and vector channels are not turned; errors of yaw are a degree or so.
+without enough pairs, with a second mode of almost as many votes, or where chi2 is below a low limit, so that estimates near their
+own error do move tokens. Headings of proposals and vector channels are not turned; errors of yaw are a degree or so.
 """
 
 from __future__ import annotations

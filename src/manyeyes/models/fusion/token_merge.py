@@ -96,12 +96,10 @@ def target_cell_keys(xy: Tensor, proposal: Tensor, grid_of: Tensor, grid: BevGri
 class TokenMerge(nn.Module):
     """Merge the tokens of a cell: softmax-weighted mean or maximum of features, softmax-weighted mean of boxes.
 
-    The softmax runs within a cell, over a learned function of proposal (heatmap, IoU, log sigma) and feature. It
-    starts as heatmap
-    logit plus IoU logit minus log sigma. Sigma combines the box error, the position error of the sender's pose and
-    the drift since the
-    observation. The number of tokens, their joint score and the spread of their boxes are added to the feature, as a
-    mean loses them.
+    The softmax runs within a cell, over a learned function of proposal (heatmap, IoU, log sigma) and feature. It starts as heatmap
+    logit plus IoU logit minus log sigma. Sigma combines the box error, the position error of the sender's pose and the drift since
+    the observation. The number of tokens, their joint score and the spread of their boxes are added to the feature, as a mean loses
+    them.
     """
 
     def __init__(self, channels: int, reduce: Literal["softmax", "max"]) -> None:

@@ -44,13 +44,11 @@ class PerAgentType(nn.Module):
 
 
 class AgentAttention(nn.Module):
-    """Heterogeneous attention between the rows of one cell: projections per agent type, and a matrix per head and edge
-    type in
+    """Heterogeneous attention between the rows of one cell: projections per agent type, and a matrix per head and edge type in
     logits and messages.
 
-    One softmax covers all keys although the matrices differ by edge type. Keys and values are stored side by side for
-    queries of either
-    type, and a query is zero in the columns of the other type.
+    One softmax covers all keys although the matrices differ by edge type. Keys and values are stored side by side for queries of
+    either type, and a query is zero in the columns of the other type.
     """
 
     def __init__(self, channels: int, heads: int) -> None:

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Encode one agent's sensors to ground features: a raster of its point cloud, its images, or both, on the same cells.
 
-Cells that LiDAR and cameras both observe take the maximum of their features; other cells take those of one sensor.
-The masked maximum
-is the same that later fuses agents (:func:`manyeyes.ops.bev_warp.masked_max`).
+Cells that LiDAR and cameras both observe take the maximum of their features; other cells take those of one sensor. The masked
+maximum is the same that later fuses agents (:func:`manyeyes.ops.bev_warp.masked_max`).
 """
 
 from __future__ import annotations

@@ -2,21 +2,15 @@
 """Decode map elements from the features of a tile: a fixed number of queries, each one element of a fixed number of
 points.
 
-Sources: MapTR (Liao et al., ICLR 2023): hierarchical queries as sums of instance and point embeddings, reference
-points refined layer
-by layer. MapTRv2 (IJCV 2024): decoupled self-attention among and within instances, and a second group of queries for
-one-to-many
-matching in training. Deformable DETR (ICLR 2021): deformable attention, and queries initialised with first-stage
-proposals (section
-4.2). DAB-DETR (ICLR 2022): each layer receives the current point positions. The two groups never attend to each
-other; the same layers
-run on each.
+Sources: MapTR (Liao et al., ICLR 2023): hierarchical queries as sums of instance and point embeddings, reference points refined
+layer by layer. MapTRv2 (IJCV 2024): decoupled self-attention among and within instances, and a second group of queries for
+one-to-many matching in training. Deformable DETR (ICLR 2021): deformable attention, and queries initialised with first-stage
+proposals (section 4.2). DAB-DETR (ICLR 2022): each layer receives the current point positions. The two groups never attend to each
+other; the same layers run on each.
 
 Differences to MapTR, for small data sets and few steps: an element starts as a line of the predicted line field
-(models/maps/line_field_head.py) with its class and score, and layers predict residuals. Positions enter every layer
-and the point
-branches. Points move by fractions of the tile, not by logits, whose gradients vanish at the tile's border, where
-lines are cut. A
+(models/maps/line_field_head.py) with its class and score, and layers predict residuals. Positions enter every layer and the point
+branches. Points move by fractions of the tile, not by logits, whose gradients vanish at the tile's border, where lines are cut. A
 layer attends to the ground before it compares queries.
 """
 

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Encode images to features at an eighth or a quarter of their size: a residual network and a feature pyramid.
 
-Sources: He et al., CVPR 2016 (basic and bottleneck blocks); Lin et al., CVPR 2017 (top-down pyramid). Batch norms use
-running
-statistics after training, so that the features of one agent do not depend on the rest of the batch. A norm over
-channels does not
+Sources: He et al., CVPR 2016 (basic and bottleneck blocks); Lin et al., CVPR 2017 (top-down pyramid). Batch norms use running
+statistics after training, so that the features of one agent do not depend on the rest of the batch. A norm over channels does not
 train on rasters, most of whose cells are empty: docs/concepts/map-model.md.
 """
 

@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Predict a line field on a tile, offset and direction of the nearest line at every cell, and trace lines in it.
 
-The lines initialise the decoder's queries: the two stages of Deformable DETR (Zhu et al., ICLR 2021, section 4.2)
-with whole polylines
-as proposals. The field trains on few tiles, because every cell is supervised; the decoder only refines. Offset and
-direction fields
-are known from lane detection; lines are traced along them, and those that overlap a higher-scored line are
+The lines initialise the decoder's queries: the two stages of Deformable DETR (Zhu et al., ICLR 2021, section 4.2) with whole
+polylines as proposals. The field trains on few tiles, because every cell is supervised; the decoder only refines. Offset and
+direction fields are known from lane detection; lines are traced along them, and those that overlap a higher-scored line are
 suppressed.
 
 A ring is represented by its middle line and half width, and proposed as the rectangle around that line.

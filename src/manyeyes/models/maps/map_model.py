@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The semi-global map model: extract_features (sensors to tokens), fuse (tokens to a tile), predict_elements.
 
-Source: CrowdMap section 2.2. All observations, the ego's included, reach the tile as tokens: ground cells with a
-feature each, warped by
-the reported pose. A frame is one agent at one time: ten frames of a tile may be ten agents, or one agent that passed.
+Source: CrowdMap section 2.2. All observations, the ego's included, reach the tile as tokens: ground cells with a feature each,
+warped by the reported pose. A frame is one agent at one time: ten frames of a tile may be ten agents, or one agent that passed.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Transform image features to ground features: every ground cell samples the images that observe it.
 
-Two methods share one signature. ``lift_ground`` projects the cell as a piece of flat road (inverse perspective
-mapping), without
-parameters. ``lift_depth`` projects points at several heights and weights each by the predicted likelihood of its
-depth:
-Lift-Splat-Shoot (Philion and Fidler, ECCV 2020) as a gather, so that one bilinear sampling replaces the scatter.
-Cells observed by
+Two methods share one signature. ``lift_ground`` projects the cell as a piece of flat road (inverse perspective mapping), without
+parameters. ``lift_depth`` projects points at several heights and weights each by the predicted likelihood of its depth:
+Lift-Splat-Shoot (Philion and Fidler, ECCV 2020) as a gather, so that one bilinear sampling replaces the scatter. Cells observed by
 several cameras are averaged.
 """
 
@@ -159,9 +156,8 @@ def lift_depth(
     """Lift as in :func:`lift_ground`, with a depth distribution (V, bins.num_bins, h, w) per pixel, at heights_m
     above the road.
 
-    A point takes its pixel's feature times the likelihood of its depth, interpolated linearly; a cell sums over
-    heights. Points outside
-    the depth range are not observed.
+    A point takes its pixel's feature times the likelihood of its depth, interpolated linearly; a cell sums over heights. Points
+    outside the depth range are not observed.
     """
     _check(features, rig)
     if depth.shape != (features.shape[0], bins.num_bins, *features.shape[-2:]):

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Improved FeaKM keypoints: decoded boxes with descriptors of the tokens around them, in the axes of the box.
 
-Differences to the published keypoints (models/pose/keypoint_net.py): positions are box centres, without cell
-quantisation and
-half-pixel shift. Views are described independently, each token scaled by its own norm. Samples and vector channels
-rotate with the
+Differences to the published keypoints (models/pose/keypoint_net.py): positions are box centres, without cell quantisation and
+half-pixel shift. Views are described independently, each token scaled by its own norm. Samples and vector channels rotate with the
 box, so that a descriptor does not depend on the agent's heading.
 """
 

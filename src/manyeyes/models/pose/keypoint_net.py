@@ -2,10 +2,8 @@
 """FeaKM's published keypoints: peaks of the confidence map, descriptors of a dense network at an eighth of its
 resolution.
 
-FeaKM section 4.2.1. Where the paper is silent, the behaviour of its public code is reproduced with its defects: a
-keypoint is the
-corner of its cell, not its centre; channels are scaled by the largest value of all views that are described together,
-so that the
+FeaKM section 4.2.1. Where the paper is silent, the behaviour of its public code is reproduced with its defects: a keypoint is the
+corner of its cell, not its centre; channels are scaled by the largest value of all views that are described together, so that the
 descriptors of one agent depend on the other; and lists are filled up with unmarked copies of the first grid cell.
 """
 
@@ -31,8 +29,7 @@ DESCRIPTOR_STRIDE = 8
 
 @dataclass(frozen=True, eq=False)
 class DetectorView:
-    """Input of the keypoint networks: one agent's tokens (N, C), their heatmap probabilities (N,) and its decoded
-    boxes in
+    """Input of the keypoint networks: one agent's tokens (N, C), their heatmap probabilities (N,) and its decoded boxes in
     descending order of score, all in its own frame.
     """
 

@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Match the keypoints of two agents: stacked self- and cross-attention, and an assignment matrix.
 
-FeaKM section 4.2.2 (Eq. 4, 5) with rotary position encoding (Su et al., RoFormer). The assignment is that of
-LightGlue (Lindenberger
-et al. 2023), used unchanged by FeaKM's code: log P_ij is the row-wise plus the column-wise log softmax of the
-similarity, plus the
-log sigmoid of both matchabilities.
+FeaKM section 4.2.2 (Eq. 4, 5) with rotary position encoding (Su et al., RoFormer). The assignment is that of LightGlue
+(Lindenberger et al. 2023), used unchanged by FeaKM's code: log P_ij is the row-wise plus the column-wise log softmax of the
+similarity, plus the log sigmoid of both matchabilities.
 """
 
 from __future__ import annotations

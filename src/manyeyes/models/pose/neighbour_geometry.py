@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Encode the relative geometry of the objects around an object, invariant to the agent's pose.
 
-Rotary positions are invariant to translation, not to rotation. Distances, bearings from the object's axis and
-relative headings are
+Rotary positions are invariant to translation, not to rotation. Distances, bearings from the object's axis and relative headings are
 invariant to both. Headings are known modulo pi, so angles are doubled.
 """
 

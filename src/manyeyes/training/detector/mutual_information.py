@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Losses of the token selector: L1 norm of the mask and mutual information of the kept tokens (CoSTr Eq. 10 to 12).
 
-Eq. 10 as printed compares an aggregate with itself, so its gradient carries no information. Here the masked tokens of
-a window are
-compared with its relevant tokens according to the detector's own targets, by an unnormalised product. Masking
-relevant tokens lowers
-the agreement, and no scale of the mask cancels. Two more targets are for studies: the receiver's own features, which
-is the corrected
-paper but drops what only the sender observes, and Eq. 10 as printed.
+Eq. 10 as printed compares an aggregate with itself, so its gradient carries no information. Here the masked tokens of a window are
+compared with its relevant tokens according to the detector's own targets, by an unnormalised product. Masking relevant tokens
+lowers the agreement, and no scale of the mask cancels. Two more targets are for studies: the receiver's own features, which is the
+corrected paper but drops what only the sender observes, and Eq. 10 as printed.
 """
 
 from __future__ import annotations
@@ -65,9 +62,8 @@ def window_mutual_information(
 class AgentPairTokens:
     """Senders' and receivers' tokens in the receivers' windows, for the study targets.
 
-    sent (N, C) and own (M, C): unit features, rotated to the receivers' axes; sent_mask (N,); sent_row (N,) and
-    own_row (M,): window
-    numbers from 0.
+    sent (N, C) and own (M, C): unit features, rotated to the receivers' axes; sent_mask (N,); sent_row (N,) and own_row (M,):
+    window numbers from 0.
     """
 
     sent: Tensor

@@ -90,9 +90,8 @@ class BoxBatch:
 def assign_targets(sites: Sites, truth: Sequence[Boxes] | BoxBatch, config: TargetConfig) -> Targets:
     """Assign ground truth boxes to sites: the nearest site of a box is its centre; no site serves two boxes.
 
-    Pairs are taken in ascending order of distance (ties by site, then box), so that a box whose nearest site is taken
-    gets the next. A box
-    without site within assign_radius_m has no centre. truth: of every grid of the batch.
+    Pairs are taken in ascending order of distance (ties by site, then box), so that a box whose nearest site is taken gets the
+    next. A box without site within assign_radius_m has no centre. truth: of every grid of the batch.
     """
     batch = truth if isinstance(truth, BoxBatch) else BoxBatch.of(truth, sites.key.device)
     places, row = batch.near(sites)

@@ -173,9 +173,8 @@ class DetectorTask(Task[DetectorTrainConfig, Detector, Sample]):
 def _load_weights(model: Detector, start: Path) -> None:
     """Initialise the model from a file.
 
-    New modules keep their initialisation, and new rows and columns of a matrix start at zero, so that both have no
-    effect at first. Modules
-    that the model lacks are skipped, as in an ablation. The heat of a class is that of the class in the file.
+    New modules keep their initialisation, and new rows and columns of a matrix start at zero, so that both have no effect at first.
+    Modules that the model lacks are skipped, as in an ablation. The heat of a class is that of the class in the file.
     """
     state, own = checkpoint.read_state(start), model.state_dict()
     begun = {name: _grow(value, state[name]) for name, value in own.items() if name in state}

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Make training tiles: an area that agents of a recording passed, some of their frames, and the ground truth map.
 
-A map is static, so frames of any time and of other scenarios of the same town are combined. Source: CrowdMap sections
-2.2 and 3.1 (ten
-random frames of a tile of 120 m by 60 m). The split is by town and asserted.
+A map is static, so frames of any time and of other scenarios of the same town are combined. Source: CrowdMap sections 2.2 and 3.1
+(ten random frames of a tile of 120 m by 60 m). The split is by town and asserted.
 """
 
 from __future__ import annotations

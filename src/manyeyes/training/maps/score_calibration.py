@@ -2,11 +2,9 @@
 """Calibrate the scores of a map model after training to the fraction of an element that is correct and not a
 duplicate.
 
-Map fusion (maps/fusion/existence.py) uses scores of several models as probabilities, which training does not provide.
-A repeated line
-carries no new information. Source: Platt, "Probabilistic outputs for support vector machines", 1999: a linear
-function of the logits,
-here per class.
+Map fusion (maps/fusion/existence.py) uses scores of several models as probabilities, which training does not provide. A repeated
+line carries no new information. Source: Platt, "Probabilistic outputs for support vector machines", 1999: a linear function of the
+logits, here per class.
 """
 
 from __future__ import annotations

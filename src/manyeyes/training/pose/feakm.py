@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train FeaKM's network to match the keypoints of two agents: ground truth, loss, augmentation, and the task.
 
-Ground truth is geometric: the other agent's keypoints are transformed by the true pose. Mutual nearest neighbours
-within match_radius_m
-match; keypoints without neighbour within unmatched_radius_m are unmatched; others are ignored. The loss averages -log
-P of the matches
-and of the unmatched points with weight one half each, over all layers.
+Ground truth is geometric: the other agent's keypoints are transformed by the true pose. Mutual nearest neighbours within
+match_radius_m match; keypoints without neighbour within unmatched_radius_m are unmatched; others are ignored. The loss averages
+-log P of the matches and of the unmatched points with weight one half each, over all layers.
 """
 
 from __future__ import annotations

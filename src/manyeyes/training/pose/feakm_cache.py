@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cache the outputs of a frozen detector on a recording, on which FeaKM's matcher is trained.
 
-One file per snapshot, written atomically, in a folder named by the detector's fingerprint, so that views of other
-weights are never
+One file per snapshot, written atomically, in a folder named by the detector's fingerprint, so that views of other weights are never
 mixed. An interrupted build resumes.
 """
 
