@@ -45,7 +45,7 @@ from manyeyes.maps.fusion.incremental import IncrementalMap
 from manyeyes.maps.store.executors import make_executor
 from manyeyes.maps.store.log_index import IndexRow, LogIndex
 from manyeyes.maps.store.store import MapStore
-from manyeyes.maps.store.tiled_fusion import FusionJob, StepResult, StepTask, TiledFusionConfig, fuse_and
+from manyeyes.maps.store.tiled_fusion import FusionJob, FusionStepResult, StepTask, TiledFusionConfig, fuse_and
 from manyeyes.ops.polyline import close_rings, resample
 from manyeyes.ops.polyline_distance import chamfer_distance
 from manyeyes.simulator.fleet import CROWDS, CrowdConfig, load_place, simulate_crowd
@@ -284,12 +284,12 @@ class _NoWork:
     def delete(self, _: Sequence[str]) -> None:
         """Nothing is there."""
 
-    def run(self, _: object, tasks: Iterable[StepTask]) -> Iterator[tuple[int, StepResult]]:
+    def run(self, _: object, tasks: Iterable[StepTask]) -> Iterator[tuple[int, FusionStepResult]]:
         """Names such as a worker would return."""
         for index, task in enumerate(tasks):
             self.tasks += 1
             names = ("poses", "sums") if task.kind == "solve" else ("poses",)
-            yield index, StepResult(tuple(f"{task.folder}/{task.digest}-{task.digest}.{name}" for name in names))
+            yield index, FusionStepResult(tuple(f"{task.folder}/{task.digest}-{task.digest}.{name}" for name in names))
 
 
 def driver(elements: int, seed: int) -> Driver:

@@ -23,7 +23,7 @@ from manyeyes.maps.store.observation_log import read_active
 from manyeyes.maps.store.store import MapStore
 from manyeyes.maps.store.tiled_fusion import (
     FusionJob,
-    StepResult,
+    FusionStepResult,
     TiledFusionConfig,
     fuse_and,
     fuse_tiles,
@@ -233,7 +233,7 @@ class NoWork:
     def run(self, _, tasks):
         for index, task in enumerate(tasks):
             names = ("poses", "sums") if task.kind == "solve" else ("poses",)
-            yield index, StepResult(tuple(f"{task.folder}/{'0' * 32}-{'1' * 32}.{name}" for name in names))
+            yield index, FusionStepResult(tuple(f"{task.folder}/{'0' * 32}-{'1' * 32}.{name}" for name in names))
 
 
 def test_what_the_driver_holds_grows_by_names_of_blocks_alone(tmp_path):

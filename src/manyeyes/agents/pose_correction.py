@@ -178,24 +178,11 @@ class PoseCorrection:
         for n, estimate in enumerate(pairwise_estimates):
             if n in propagated and contradicts_both(estimate, priors[n], propagated[n]):
                 pairwise_estimates[n] = no_estimate(priors[n], PoseStatus.AMBIGUOUS)
-        health = []
-        for message, prior, pairwise in zip(messages, priors, pairwise_estimates):
-            before = new_states.get(message.agent_id)
-            state, report = self._update_monitor(before.monitor if before else None, message, prior, pairwise)
-            # The last entries are those of the last received senders.
-            new_states.pop(message.agent_id, None)
-            new_states[message.agent_id] = SenderState(state, body=bodies.get(message.agent_id))
-            health.append(report)
-        at_propagated = set[int]()
-        for n, prior in propagated.items():
-            if pairwise_estimates[n].status.has_estimate:
-                continue
-            estimate = load_corrector(self.corrector)(own, landmarks[n], prior)
-            if contradicts_both(estimate, priors[n], prior):
-                estimate = no_estimate(prior, PoseStatus.AMBIGUOUS)
-            if estimate.status.has_estimate or not self._supports_stated(priors[n], prior):
-                priors[n], pairwise_estimates[n] = prior, estimate
-                at_propagated.add(n)
+        health = [
+            self._update_monitor(new_states, bodies, message, prior, estimate)
+            for message, prior, estimate in zip(messages, priors, pairwise_estimates)
+        ]
+        at_propagated = self._use_propagated(own, landmarks, priors, pairwise_estimates, propagated)
         bodies = self._update_bodies(frame, messages, (own, *landmarks), pairwise_estimates, bodies)
         joint, inconsistent = self._optimize_jointly(messages, (own, *landmarks), priors, pairwise_estimates)
         kept, corrections = [], []
@@ -211,18 +198,17 @@ class PoseCorrection:
                 kept.append(message)
             elif use is MessageUse.CORRECTED:
                 kept.append(apply_correction(message, frame, estimate))
-            # Do not propagate from a pose that conflicts with the prior: an error would persist.
-            refuted = use is MessageUse.INCONSISTENT or estimate.status is PoseStatus.CONFLICT
-            put = last_corrected.get(message.agent_id)
-            if use is MessageUse.CORRECTED:
-                put = kept[-1]
+            last = last_corrected.get(message.agent_id)
+            if use is MessageUse.INCONSISTENT or estimate.status is PoseStatus.CONFLICT:
+                # Do not propagate from a pose that conflicts with the prior: an error would persist.
+                last = None
+            elif use is MessageUse.CORRECTED:
+                last = kept[-1]
             elif n in propagated:
                 # The prior is not part of it: what is propagated stays independent of it.
-                put = apply_correction(message, frame, no_estimate(propagated[n]))
+                last = apply_correction(message, frame, no_estimate(propagated[n]))
             new_states[message.agent_id] = replace(
-                new_states[message.agent_id],
-                last_corrected=None if refuted else put,
-                body=bodies.get(message.agent_id),
+                new_states[message.agent_id], last_corrected=last, body=bodies.get(message.agent_id)
             )
         if bodies.get(frame.agent_id) is not None:
             before = new_states.pop(frame.agent_id, SenderState(PoseMonitorState.new()))
@@ -321,6 +307,29 @@ class PoseCorrection:
                 propagated[n] = prior
         return propagated
 
+    def _use_propagated(
+        self,
+        own: Landmarks,
+        landmarks: Sequence[Landmarks],
+        priors: list[PosePrior | None],
+        estimates: list[PoseEstimate],
+        propagated: Mapping[int, PosePrior],
+    ) -> set[int]:
+        """Match again with the propagated priors where nothing was measured, and put these and the new estimates in place where
+        they are better; returns the rows of these.
+        """
+        used = set[int]()
+        for n, prior in propagated.items():
+            if estimates[n].status.has_estimate:
+                continue
+            estimate = load_corrector(self.corrector)(own, landmarks[n], prior)
+            if contradicts_both(estimate, priors[n], prior):
+                estimate = no_estimate(prior, PoseStatus.AMBIGUOUS)
+            if estimate.status.has_estimate or not self._supports_stated(priors[n], prior):
+                priors[n], estimates[n] = prior, estimate
+                used.add(n)
+        return used
+
     def _propagate_prior(
         self, frame: AgentFrame, cache: PerceptionCache, last: Message, message: Message
     ) -> PosePrior | None:
@@ -336,14 +345,24 @@ class PoseCorrection:
         return propagate_prior(PosePrior.between(frame, last), motion)
 
     def _update_monitor(
-        self, state: PoseMonitorState | None, message: Message, prior: PosePrior | None, estimate: PoseEstimate
-    ) -> tuple[PoseMonitorState, PoseReport]:
-        """State and report of the monitor after this message; a repeated message does not change them."""
-        state, time_s = state or PoseMonitorState.new(), message.timestamp_ns * 1e-9
-        # A decreasing timestamp starts a new drive.
-        state = PoseMonitorState.new() if len(state.time_s) and time_s < state.time_s[-1] else state
-        again = bool(len(state.time_s)) and time_s == state.time_s[-1]
-        return update_monitor(state, estimate, None if again else prior, time_s, self.monitor)
+        self,
+        states: dict[int, SenderState],
+        bodies: Mapping[int, BodyEstimate | None],
+        message: Message,
+        prior: PosePrior | None,
+        estimate: PoseEstimate,
+    ) -> PoseReport:
+        """Update the monitor of a message's sender and return its report; a repeated message does not change the monitor."""
+        # The last entries are those of the last received senders.
+        before = states.pop(message.agent_id, None)
+        monitor, time_s = before.monitor if before else PoseMonitorState.new(), message.timestamp_ns * 1e-9
+        if len(monitor.time_s) and time_s < monitor.time_s[-1]:
+            # A decreasing timestamp starts a new drive.
+            monitor = PoseMonitorState.new()
+        again = bool(len(monitor.time_s)) and time_s == monitor.time_s[-1]
+        monitor, report = update_monitor(monitor, estimate, None if again else prior, time_s, self.monitor)
+        states[message.agent_id] = SenderState(monitor, body=bodies.get(message.agent_id))
+        return report
 
     def _optimize_jointly(
         self,

@@ -15,7 +15,7 @@ from manyeyes._text import count_noun
 
 if TYPE_CHECKING:
     from manyeyes.datasets.missing import MissingFiles
-    from manyeyes.datasets.recording_check import AgentSensor, RecordingCheck
+    from manyeyes.datasets.recording_check import ReadSensor, RecordingCheck
     from manyeyes.ops.lidar.sweep_statistics import SensorDomain
 
 _MAX_LINES = 8
@@ -92,7 +92,7 @@ def _describe(found: RecordingCheck, missing: MissingFiles, summary: tuple[str, 
         yield "all intensities are equal: the clouds store none, and the shipped weights then find much less"
 
 
-def _describe_sensors(sensors: list[AgentSensor], kind: str) -> str:
+def _describe_sensors(sensors: list[ReadSensor], kind: str) -> str:
     sweeps = [sensor.sweep for sensor in sensors]
     periods = [sensor.period_s for sensor in sensors if sensor.period_s is not None]
     parts = [

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from manyeyes.agents.replay import ReplayConfig
     from manyeyes.datasets.base import Recording
     from manyeyes.evaluation.detection.accumulator import MethodResult
+    from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
     from manyeyes.models.detector.protocols import BoxDetector
     from manyeyes.viz.results import MethodComparison
 
@@ -54,13 +55,7 @@ def _evaluate(options: Options) -> None:
 
     from manyeyes._io import atomic_write_text
     from manyeyes.datasets.registry import open_recording
-    from manyeyes.evaluation.detection.benchmark import (
-        BenchmarkConfig,
-        check_class,
-        load_detector,
-        resolve_protocol,
-        run_benchmark,
-    )
+    from manyeyes.evaluation.detection.benchmark import check_class, load_detector, resolve_protocol, run_benchmark
     from manyeyes.models.pretrained import read_training_seed
     from manyeyes.studies import provenance
     from manyeyes.studies.recordings import adapt_to_dataset, check_evaluated_frames, check_files
@@ -69,19 +64,7 @@ def _evaluate(options: Options) -> None:
     from manyeyes.viz.progress import track
     from manyeyes.viz.results import format_comparison_markdown, print_comparison, summarize_comparison
 
-    console = Console()
-    errors, sigma_yaw_rad = options.pose_errors, math.radians(options.noise_yaw_deg)
-    noise = errors.make_pose_noise(options.seed).at_level(options.noise_xy_m, sigma_yaw_rad)
-    config = BenchmarkConfig(
-        weights=options.replay_options.weights,
-        methods=options.replay_options.methods,
-        protocol=options.protocol,
-        replay=options.replay_options.make_replay_config(options.seed, options.all_egos),
-        pose_noise=noise,
-        odometry_drift=None if noise is None else errors.make_odometry_drift(options.seed),
-        frame_stride=options.frame_stride,
-        scenario_stride=options.scenario_stride,
-    )
+    console, config = Console(), _make_config(options)
     protocol, detector = resolve_protocol(config), load_detector(config.weights)
     check_class(options.object_class, protocol.classes)
     thresholds = load_thresholds(options.thresholds, options.data, options.split) if options.thresholds else None
@@ -101,7 +84,7 @@ def _evaluate(options: Options) -> None:
     data_name = f"{options.data.name}{f'/{options.split}' if options.split else ''}"
     held = count_noun(num_scenarios, "scenario")
     title = f"{display_name(options.replay_options.weights)} on {data_name}: {held}, {protocol.name}"
-    note = "" if noise is None else errors.describe(options.seed)
+    note = "" if config.pose_noise is None else options.pose_errors.describe(options.seed)
     print_comparison(console, comparison, title)
     if note:
         console.print(note, highlight=False, soft_wrap=True)
@@ -111,6 +94,23 @@ def _evaluate(options: Options) -> None:
     origin = provenance.write_json(path, comparison, {"options": options, "benchmark": config}, options.seed)
     page = _save_page(options.out, title, comparison, note, origin)
     console.print(f"\nNumbers, configuration and versions are in {path}; open {page}", highlight=False, soft_wrap=True)
+
+
+def _make_config(options: Options) -> BenchmarkConfig:
+    from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
+
+    errors, sigma_yaw_rad = options.pose_errors, math.radians(options.noise_yaw_deg)
+    noise = errors.make_pose_noise(options.seed).at_level(options.noise_xy_m, sigma_yaw_rad)
+    return BenchmarkConfig(
+        weights=options.replay_options.weights,
+        methods=options.replay_options.methods,
+        protocol=options.protocol,
+        replay=options.replay_options.make_replay_config(options.seed, options.all_egos),
+        pose_noise=noise,
+        odometry_drift=None if noise is None else errors.make_odometry_drift(options.seed),
+        frame_stride=options.frame_stride,
+        scenario_stride=options.scenario_stride,
+    )
 
 
 def _save_page(out: Path, title: str, comparison: MethodComparison, note: str, origin: dict[str, Any]) -> Path:

@@ -57,7 +57,7 @@ class HeldMessage:
 
 
 @dataclass
-class Sender:
+class SenderEntry:
     """One sender: its message, or two of one instant; number of its messages; what arrived in the current instant.
 
     last_packet: number of its last packet, among the packets of all senders.
@@ -87,7 +87,7 @@ class SenderTable:
 
     def __init__(self, limits: ReceiverLimits) -> None:
         self._limits = limits
-        self._senders: dict[int, Sender] = {}
+        self._senders: dict[int, SenderEntry] = {}
         self._num_packets = 0
         self._trust: Mapping[int, float] = {}
         # Half of the memory is divided evenly, so that no sender exhausts that of others; the rest is for senders that need more.
@@ -160,7 +160,7 @@ class SenderTable:
         shortest = min((message.packet_bytes for message in same_instant), default=0)
         return "superseded" if len(same_instant) > 1 and len(envelope.packet) <= shortest else None
 
-    def _same_instant(self, sender: Sender, stamp: int) -> list[HeldMessage]:
+    def _same_instant(self, sender: SenderEntry, stamp: int) -> list[HeldMessage]:
         """Return the messages of a sender that a new one does not supersede."""
         newest = max((message.timestamp_ns for message in sender.messages), default=stamp)
         return [m for m in sender.messages if m.timestamp_ns > max(stamp, newest) - self._limits.min_stamp_spacing_ns]
@@ -180,7 +180,7 @@ class SenderTable:
         if reason is not None:
             return reason
         if sender is None or held is None:
-            new = Sender(instant_start_ns=arrival_ns, instant_packets=1, instant_bytes=size)
+            new = SenderEntry(instant_start_ns=arrival_ns, instant_packets=1, instant_bytes=size)
             return self._begin_message(sender or new, fragment, amount, arrival_ns)
         memory = held.memory if len(sender.messages) == 1 else sender.memory
         if not self._has_memory(sender, memory + amount.memory):
@@ -206,7 +206,7 @@ class SenderTable:
         return content if count > self._max_counts[content] else None
 
     def _begin_message(
-        self, sender: Sender, fragment: Fragment, amount: _Amount, arrival_ns: int | None
+        self, sender: SenderEntry, fragment: Fragment, amount: _Amount, arrival_ns: int | None
     ) -> DropReason | None:
         """Begin a message of a sender with its first packet, which passed check_stamp; the reason where a bound excludes it."""
         same_instant, size = self._same_instant(sender, fragment.header.timestamp_ns), len(fragment.packet)
@@ -224,13 +224,13 @@ class SenderTable:
         self._record_arrival(sender, arrival_ns)
         return None
 
-    def _record_arrival(self, sender: Sender, arrival_ns: int | None) -> None:
+    def _record_arrival(self, sender: SenderEntry, arrival_ns: int | None) -> None:
         self._num_packets += 1
         sender.last_packet = self._num_packets
         if arrival_ns is not None and (sender.last_arrival_ns is None or arrival_ns > sender.last_arrival_ns):
             sender.last_arrival_ns = arrival_ns
 
-    def _has_memory(self, sender: Sender, memory: int) -> bool:
+    def _has_memory(self, sender: SenderEntry, memory: int) -> bool:
         """Return whether the messages of a sender may take this much memory."""
         excess = memory - self._own_memory
         if excess <= 0:
@@ -259,7 +259,7 @@ class SenderTable:
     def _trust_of(self, agent_id: int) -> float:
         return self._trust.get(agent_id, UNKNOWN_TRUST)
 
-    def _is_silent(self, sender: Sender, now_ns: int | None) -> bool:
+    def _is_silent(self, sender: SenderEntry, now_ns: int | None) -> bool:
         """Return whether nothing came from a sender for max_silence_ns; unknown without a clock, hence False."""
         if now_ns is None:
             return False

@@ -15,7 +15,7 @@ from manyeyes.ops.lidar.sweep_statistics import SweepStatistics, measure_sweep
 
 
 @dataclass(frozen=True)
-class AgentSensor:
+class ReadSensor:
     """The sensor of one agent of a scenario.
 
     Attributes:
@@ -51,7 +51,7 @@ class RecordingCheck:
     num_scenarios: int
     num_snapshots: int
     num_read: int
-    sensors: tuple[AgentSensor, ...]
+    sensors: tuple[ReadSensor, ...]
     num_boxes: dict[str, int]
     num_listed: int
     num_empty: int
@@ -76,7 +76,7 @@ def check_recording(
         progress: called with the number of read scenarios and of all that are read.
     """
     names = _spread(recording.scenarios, max_scenarios)
-    sensors, labels, listed, empty, num_read = list[AgentSensor](), Counter[str](), 0, 0, 0
+    sensors, labels, listed, empty, num_read = list[ReadSensor](), Counter[str](), 0, 0, 0
     disorder = list[str]()
     for done, name in enumerate(names, 1):
         snapshots = _read_pair(recording, name)
@@ -96,7 +96,7 @@ def check_recording(
     )
 
 
-def measure_first_sweeps(recording: Recording, scenario: str) -> list[AgentSensor]:
+def measure_first_sweeps(recording: Recording, scenario: str) -> list[ReadSensor]:
     """Measure the sensors of the agents of one scenario from its first two evaluated snapshots."""
     return _find_sensors(scenario, _read_pair(recording, scenario))
 
@@ -116,7 +116,7 @@ def _read_pair(recording: Recording, scenario: str) -> list[Snapshot]:
     return [recording.snapshot(scenario, index) for index in range(first, min(first + 2, length))]
 
 
-def _find_sensors(scenario: str, snapshots: Sequence[Snapshot]) -> list[AgentSensor]:
+def _find_sensors(scenario: str, snapshots: Sequence[Snapshot]) -> list[ReadSensor]:
     frames: dict[int, list[AgentFrame]] = {}
     for snapshot in snapshots:
         for frame in snapshot.frames:
@@ -126,7 +126,7 @@ def _find_sensors(scenario: str, snapshots: Sequence[Snapshot]) -> list[AgentSen
         steps = [(b.timestamp_ns - a.timestamp_ns) / 1e9 for a, b in pairwise(own)]
         sweep = measure_sweep(own[0].points, own[0].sensor_height_m)
         period_s = median(steps) if steps and median(steps) > 0 else None
-        found.append(AgentSensor(scenario, agent_id, own[0].is_infrastructure, sweep, period_s))
+        found.append(ReadSensor(scenario, agent_id, own[0].is_infrastructure, sweep, period_s))
     return found
 
 

@@ -25,7 +25,7 @@ _BLOCK = 128
 """Pairs of a block."""
 
 
-class _PairBlock(NamedTuple):
+class _OuterBlock(NamedTuple):
     """Pairs start … end of rows source (P,) of the inputs and target (P,) of the outputs."""
 
     source: I64x1
@@ -59,7 +59,7 @@ def _add_taps(
     for k in range(counts.shape[0]):
         end = at + counts[k]
         for start in range(at, end, _BLOCK):
-            block, column = _PairBlock(source, target, start, min(start + _BLOCK, end)), 0
+            block, column = _OuterBlock(source, target, start, min(start + _BLOCK, end)), 0
             while column < dy.shape[1]:
                 if _WIDE and column + 4 * LANES <= dy.shape[1]:
                     _add_four(x, dy, block, column, out[tap])
@@ -77,7 +77,7 @@ def _columns(vectors: int) -> Any:
     """What adds the products of a block with so many vectors of outputs from column on."""
 
     @njit(cache=True, nogil=True)
-    def add(x: F32x2, dy: F32x2, block: _PairBlock, column: int, out: F32x2) -> None:  # pragma: no cover
+    def add(x: F32x2, dy: F32x2, block: _OuterBlock, column: int, out: F32x2) -> None:  # pragma: no cover
         source, target, start, end = block
         whole = x.shape[1] // 6 * 6
         for first in range(0, whole, 6):

@@ -21,8 +21,8 @@ COMMAND = "command"
 
 
 @dataclass(frozen=True)
-class StoredTable:
-    """A study's JSON. commit: of the sources that made it; empty where it does not say."""
+class ResultFile:
+    """A study's JSON. commit: of the sources that made it; empty where it is not stated."""
 
     path: Path
     study: str
@@ -48,7 +48,7 @@ class StoredRow:
         return tuple(_find_differences("", stored, made, tolerance))
 
 
-def draw_rows(path: Path, count: int, seed: int) -> tuple[StoredTable, tuple[StoredRow, ...]]:
+def draw_rows(path: Path, count: int, seed: int) -> tuple[ResultFile, tuple[StoredRow, ...]]:
     """Read a stored table and draw rows of it, without replacement; all where there are fewer.
 
     Raises:
@@ -65,7 +65,7 @@ def draw_rows(path: Path, count: int, seed: int) -> tuple[StoredTable, tuple[Sto
     if not rows:
         raise ConfigError(f"{path}: the table has no row.")
     drawn = random.Random(seed).sample(rows, min(count, len(rows)))
-    return StoredTable(path, study, str(origin.get("git_commit") or "")), tuple(drawn)
+    return ResultFile(path, study, str(origin.get("git_commit") or "")), tuple(drawn)
 
 
 def clone_sources(commit: str, folder: Path) -> Path:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from manyeyes.datasets.recording_check import AgentSensor, measure_first_sweeps
+from manyeyes.datasets.recording_check import ReadSensor, measure_first_sweeps
 from manyeyes.ops.lidar.sweep_statistics import SensorDomain
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 REMEDY = "expect fewer and false boxes; see 'manyeyes check', and train on with 'manyeyes finetune'"
 
 
-def describe_deviations(sensors: Iterable[AgentSensor], domain: SensorDomain) -> dict[str, tuple[int, ...]]:
+def describe_deviations(sensors: Iterable[ReadSensor], domain: SensorDomain) -> dict[str, tuple[int, ...]]:
     """Return what lies outside of a domain, each with the agents that it is true of."""
     found: dict[str, list[int]] = {}
     for sensor in sensors:

@@ -28,7 +28,7 @@ _CORROBORATED, _REFUTED = int(Evidence.CORROBORATED), int(Evidence.REFUTED)
 
 
 @dataclass(frozen=True)
-class EvidenceConfig:
+class ClaimCheckConfig:
     """Constants of evidence on one claim.
 
     min_own_score: of a detection of the ego that supports a claim. gate_m: of a match, beyond two
@@ -77,7 +77,7 @@ def check_claims(
     own: Floats,
     claims: Sequence[Claims],
     trust: Mapping[int, float],
-    config: EvidenceConfig,
+    config: ClaimCheckConfig,
     probes: Floats,
 ) -> tuple[tuple[CheckedClaims, ...], I64x2]:
     """Return the evidence on all claims of one frame, and passing rays and hits (P, 2) of probes.
@@ -102,7 +102,7 @@ def check_claims(
     return tuple(checked), rays
 
 
-def classify_rays(rays: I64x2, config: EvidenceConfig) -> Kinds:
+def classify_rays(rays: I64x2, config: ClaimCheckConfig) -> Kinds:
     """Return (K,) the evidence of passing rays and hits (K, 2) of boxes."""
     passing, hits = rays.T
     is_refuted = (passing >= config.min_passing) & (passing >= config.passing_ratio * hits)
@@ -111,7 +111,7 @@ def classify_rays(rays: I64x2, config: EvidenceConfig) -> Kinds:
 
 
 def _check_rays(
-    frame: AgentFrame, columns: Floats, sigma_m: Floats, kinds: Kinds, config: EvidenceConfig, probes: Floats
+    frame: AgentFrame, columns: Floats, sigma_m: Floats, kinds: Kinds, config: ClaimCheckConfig, probes: Floats
 ) -> I64x2:
     """Set the evidence on the unmatched claims of all senders, in place; return the rays of the probes.
 

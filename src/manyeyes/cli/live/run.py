@@ -165,7 +165,7 @@ def _wait_for_start(options: Options, config: RunConfig, first: AgentFrame, star
 
 def _collect(run: LiveRun, options: Options, clock: LiveClock) -> RunSummary:
     """Run to the end; a signal ends it after the current frame, a second one at once."""
-    from manyeyes.runtime.observers import Observers
+    from manyeyes.runtime.run_monitors import RunMonitors
     from manyeyes.runtime.summary import RunStatistics
 
     def stop(number: int, _: object) -> None:
@@ -175,10 +175,10 @@ def _collect(run: LiveRun, options: Options, clock: LiveClock) -> RunSummary:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
     statistics, recorder = RunStatistics(options.agent, clock.rate), run.recorder
-    with Observers.open(options.agent, clock, options.metrics, sys.stderr if options.json_log else None) as observers:
+    with RunMonitors.open(options.agent, clock, options.metrics, sys.stderr if options.json_log else None) as monitors:
         for tick in run:
             statistics.add(tick)
-            observers.add(tick, run.neighbours())
+            monitors.add(tick, run.neighbours())
     if recorder is None:
         return statistics.summary()
     note = recorder.close()

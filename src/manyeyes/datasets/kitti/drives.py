@@ -37,7 +37,7 @@ _EARTH_RADIUS_M = 6378137.0
 _Item = TypeVar("_Item")
 
 
-class Drive(Protocol):
+class KittiDrive(Protocol):
     """One scenario: consecutive sweeps of one LiDAR."""
 
     @property

@@ -14,7 +14,7 @@ from manyeyes.datasets.base import RecordingReader, require_index
 from manyeyes.datasets.formats.point_file import read_bin
 from manyeyes.datasets.kitti.drives import (
     OBJECT_PARTS,
-    Drive,
+    KittiDrive,
     ObjectFrame,
     OdometrySequence,
     RawDrive,
@@ -104,13 +104,13 @@ class KittiRecording(RecordingReader):
         drive = self._drive(scenario)
         return drive.calibration() if isinstance(drive, ObjectFrame) else None
 
-    def _drive(self, scenario: str) -> Drive:
+    def _drive(self, scenario: str) -> KittiDrive:
         if scenario not in self._drives:
             require_index(self, scenario, 0)
         return self._drives[scenario]
 
     @staticmethod
-    def _speed(drive: Drive, index: int) -> float:
+    def _speed(drive: KittiDrive, index: int) -> float:
         """Return the speed since the sweep before, m/s; 0 where there is none within half a second."""
         if index == 0:
             return 0.0
@@ -119,13 +119,13 @@ class KittiRecording(RecordingReader):
         return float(moved.norm()) / seconds if 0 < seconds <= 0.5 else 0.0
 
 
-def _find_drives(folder: Path, problems: list[str], missing: list[FileProblem]) -> Mapping[str, Drive]:
+def _find_drives(folder: Path, problems: list[str], missing: list[FileProblem]) -> Mapping[str, KittiDrive]:
     """Find the drives below a folder by names; what they lack is added to problems and to missing."""
     parts = _object_folders(folder)
     if len(parts) > 1:
         names = ", ".join(part.name for part in parts)
         raise RecordingError(f"{folder}: holds several parts of KITTI's object detection ({names}); name one as split.")
-    drives: dict[str, Drive] = {}
+    drives: dict[str, KittiDrive] = {}
     for part in parts if not _sequences(folder) else ():
         has_labels = (part / "label_2").is_dir()
         for cloud in list_clouds(part / "velodyne"):

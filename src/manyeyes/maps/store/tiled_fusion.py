@@ -157,7 +157,7 @@ class StepTask:
 
 
 @dataclass(frozen=True)
-class StepResult:
+class FusionStepResult:
     """The keys of a step's results, or the observations with which it fails."""
 
     keys: tuple[str, ...]
@@ -378,20 +378,20 @@ class _Run:
 _NUM_RESULTS = {"solve": 2}
 
 
-def _run_task(task: StepTask) -> StepResult:
+def _run_task(task: StepTask) -> FusionStepResult:
     """Run a step and store its results, unless they are stored."""
     work = task.job.work
     found = sorted(key for key in work.list(task.folder) if key.startswith(f"{task.folder}/{task.digest}"))
     if len(found) == _NUM_RESULTS.get(task.kind, 1):
-        return StepResult(tuple(sorted(found, key=lambda key: key.rpartition(".")[2])))
+        return FusionStepResult(tuple(sorted(found, key=lambda key: key.rpartition(".")[2])))
     results, failures = _compute(task)
     if failures:
-        return StepResult((), failures)
+        return FusionStepResult((), failures)
     keys = _put(work, task.folder, results, task.digest)
     if task.kind == "stations":
         # Arrays are large and cheap to make again.
         work.delete(work.list(_arrays_folder(task.place)))
-    return StepResult(keys)
+    return FusionStepResult(keys)
 
 
 def _compute(task: StepTask) -> tuple[dict[str, object], tuple[FailedObservation, ...]]:

@@ -138,7 +138,7 @@ def make_landmark_scene(spec: LandmarkSpec, seed: int, scene: int) -> LandmarkSc
         there = make_later_traffic(here, extra_rng, spec.parked_fraction, partial(_make_traffic, spec.layout))
     if spec.placement != "roadside":
         unit = place_vehicle_near(ego_now, spec.placement, extra_rng)
-    observers = _Observer(spec, here, extra_rng), _Observer(spec, there, extra_rng)
+    observers = _SceneObserver(spec, here, extra_rng), _SceneObserver(spec, there, extra_rng)
     ego, other, then = [], [], []
     now_common, now_xy = np.zeros((0, 2), np.int64), np.zeros((0, 2))
     for instant in range(spec.num_instants):
@@ -174,7 +174,7 @@ def _make_traffic(layout: StreetLayout | None, rng: np.random.Generator) -> Traf
     return make_traffic(rng) if layout is None else make_street_traffic(layout, rng)
 
 
-class _Observer:
+class _SceneObserver:
     """One agent's detector, whose errors of an object are correlated over time."""
 
     def __init__(self, spec: LandmarkSpec, traffic: Traffic, rng: np.random.Generator) -> None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from manyeyes.agents.isolation import Quarantine
 from manyeyes.agents.trust.association import Floats
 from manyeyes.agents.trust.beta_trust import BetaTrust, TrustConfig, fusion_weight, update
-from manyeyes.agents.trust.claim_evidence import CheckedClaims, EvidenceConfig, check_claims
+from manyeyes.agents.trust.claim_evidence import CheckedClaims, ClaimCheckConfig, check_claims
 from manyeyes.agents.trust.claim_offset import OffsetConfig, find_offset
 from manyeyes.agents.trust.claim_tracks import ClaimChecks, count_refuted_checks, find_tracks, update_tracks
 from manyeyes.agents.trust.copies import CopyConfig, add_contents, find_copies, is_known
@@ -86,7 +86,7 @@ class NamingConfig:
 class RayEvidenceDetector(MisbehaviourDetector):
     """Evidence, trust, omissions, common offsets, copies, observers and naming, each with its constants."""
 
-    evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
+    evidence: ClaimCheckConfig = field(default_factory=ClaimCheckConfig)
     trust: TrustConfig = field(default_factory=TrustConfig)
     omissions: OmissionConfig = field(default_factory=OmissionConfig)
     naming: NamingConfig = field(default_factory=NamingConfig)

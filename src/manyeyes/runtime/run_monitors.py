@@ -15,7 +15,7 @@ from manyeyes.runtime.status_server import StatusServer
 from manyeyes.runtime.supervisor import Supervisor
 
 
-class Observers:
+class RunMonitors:
     """Metrics and log of a run, each None where it is not wanted."""
 
     def __init__(self, metrics: LiveMetrics | None = None, log: EventLog | None = None) -> None:
@@ -25,7 +25,7 @@ class Observers:
     @contextmanager
     def open(
         cls, agent_id: int, clock: LiveClock, address: str | None = None, log_stream: IO[str] | None = None
-    ) -> Iterator[Observers]:
+    ) -> Iterator[RunMonitors]:
         """Serve metrics at an address and log to a stream until the end of the block."""
         metrics = None if address is None else LiveMetrics(clock.rate)
         server = None if address is None or metrics is None else StatusServer(address, metrics)
@@ -33,9 +33,9 @@ class Observers:
         try:
             if log is not None:
                 log.write("start", rate=clock.rate)
-            observers = cls(metrics, log)
-            yield observers
-            observers._supervisor.stop()
+            monitors = cls(metrics, log)
+            yield monitors
+            monitors._supervisor.stop()
             if log is not None:
                 log.write("stop")
         finally:
@@ -43,7 +43,7 @@ class Observers:
                 server.close()
 
     def add(self, tick: LiveTick, neighbours: frozenset[str]) -> None:
-        """Show a tick to all observers."""
+        """Give a tick to all monitors."""
         self._supervisor.tick()
         if self._metrics is not None:
             self._metrics.add(tick, len(neighbours))
