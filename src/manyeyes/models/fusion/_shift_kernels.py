@@ -1,16 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loops of the shift of senders: peaks, votes for a displacement, and least squares over its pairs.
-
-Settings are the values of ``sender_shift.ShiftConfig`` in the order of its fields.
-"""
+"""Loops of the shift of senders: peaks, votes for a displacement, and least squares over its pairs."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from manyeyes._jit import F64x1, F64x2, I64x1, njit
+
+
+class ShiftSettings(NamedTuple):
+    """Fields of ``sender_shift.ShiftConfig`` by the same names."""
+
+    max_shift_m: float
+    min_pairs: int
+    vote_m: float
+    match_m: float
+    max_second: float
+    prior_sigma_m: float
+    prior_sigma_yaw_rad: float
 
 
 @njit(cache=True, nogil=True)
@@ -38,14 +48,14 @@ def pick_peaks(xy: F64x2, order: I64x1, radius_m: float, row: I64x1) -> int:  # 
 
 @njit(cache=True, nogil=True)
 def find_mode(  # pragma: no cover
-    ego_xy: F64x2, ego_weight: F64x1, xy: F64x2, weight: F64x1, settings: F64x1, mode: F64x1
+    ego_xy: F64x2, ego_weight: F64x1, xy: F64x2, weight: F64x1, settings: ShiftSettings, mode: F64x1
 ) -> bool:
     """Fill mode (2,) with the displacement from a sender's peaks to the ego's that has the best vote; returns whether there is one.
 
     Each peak of the sender votes once for a displacement: by the nearest of its pairs. There is no mode with too few voters, or
     where another displacement, apart from it, has almost as many votes. ego_xy, xy: (m, 2) and (n, 2), metres.
     """
-    max_shift_m, vote_m, prior_sigma_m = settings[3], settings[5], settings[9]
+    max_shift_m, vote_m, prior_sigma_m = settings.max_shift_m, settings.vote_m, settings.prior_sigma_m
     capacity = xy.shape[0] * ego_xy.shape[0] + 1
     away, strength = np.zeros((capacity, 2)), np.zeros(capacity)
     begin = np.empty(xy.shape[0] + 1, np.int64)
@@ -61,7 +71,7 @@ def find_mode(  # pragma: no cover
                 count += 1
         voters += count > begin[i]
     begin[xy.shape[0]] = count
-    if voters < settings[4]:
+    if voters < settings.min_pairs:
         return False
     votes, best = np.zeros(count), 0
     for c in range(count):
@@ -77,7 +87,7 @@ def find_mode(  # pragma: no cover
             best = c
     for c in range(count):
         dx, dy = away[c, 0] - away[best, 0], away[c, 1] - away[best, 1]
-        if dx * dx + dy * dy > 4 * settings[6] * settings[6] and votes[c] > settings[7] * votes[best]:
+        if dx * dx + dy * dy > 4 * settings.match_m * settings.match_m and votes[c] > settings.max_second * votes[best]:
             return False
     # The mean of the pairs that vote for the mode.
     x, y = away[best, 0], away[best, 1]
@@ -95,12 +105,14 @@ def find_mode(  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def match_peaks(ego_xy: F64x2, xy: F64x2, mode: F64x1, settings: F64x1, partner: I64x1) -> int:  # pragma: no cover
+def match_peaks(
+    ego_xy: F64x2, xy: F64x2, mode: F64x1, settings: ShiftSettings, partner: I64x1
+) -> int:  # pragma: no cover
     """Fill partner (n,) with the ego's peak of each of the sender's, -1 for none; returns the number of pairs.
 
     Pairs are the nearest of each other at the displacement mode (2,). ego_xy, xy: (m, 2) and (n, 2), metres.
     """
-    max_shift_m, match_m = settings[3], settings[6]
+    max_shift_m, match_m = settings.max_shift_m, settings.match_m
     nearest, shortest = np.full(ego_xy.shape[0], -1), np.full(ego_xy.shape[0], np.inf)
     square = np.full(xy.shape[0], np.inf)
     for i in range(xy.shape[0]):
@@ -123,14 +135,14 @@ def match_peaks(ego_xy: F64x2, xy: F64x2, mode: F64x1, settings: F64x1, partner:
 
 @njit(cache=True, nogil=True)
 def solve_pairs(  # pragma: no cover
-    arm: F64x2, measured: F64x2, precision: F64x1, settings: F64x1, estimate: F64x1, covariance: F64x2
+    arm: F64x2, measured: F64x2, precision: F64x1, settings: ShiftSettings, estimate: F64x1, covariance: F64x2
 ) -> float:
     """Fill estimate (3,) of x, y, yaw and covariance (3, 3) by least squares with Cauchy weights and a prior; returns its chi2.
 
     chi2: the part of the evidence against no error at all that the estimate explains. arm: (n, 2) places from the sender,
     measured: (n, 2) displacements, metres; precision: (n,) inverse variances.
     """
-    prior_xy, prior_yaw = 1 / (settings[9] * settings[9]), 1 / (settings[10] * settings[10])
+    prior_xy, prior_yaw = 1 / settings.prior_sigma_m**2, 1 / settings.prior_sigma_yaw_rad**2
     robust = np.ones(arm.shape[0])
     chi2 = 0.0
     for _ in range(4):

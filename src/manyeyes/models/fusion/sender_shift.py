@@ -20,6 +20,7 @@ from manyeyes.models.detector.box_head import BOX_LAYOUT
 from manyeyes.models.detector.proposal import proposed_heat, proposed_offset
 from manyeyes.models.detector.transformer import AttentionConfig
 from manyeyes.models.fusion import _shift_kernels
+from manyeyes.models.fusion._shift_kernels import ShiftSettings
 from manyeyes.models.fusion.registry import get_fusion, register_fusion
 from manyeyes.models.fusion.token_merge import DRIFT_MPS, MAX_OFFSET_CELLS
 from manyeyes.models.fusion.transform_tokens import Tokens
@@ -99,7 +100,7 @@ class SenderShift:
 
 def estimate_shift(ego: Peaks, sender: Peaks, origin: F64, config: ShiftConfig = DEFAULT_SHIFT) -> SenderShift | None:
     """Return the correction of a sender at origin (2,) in the ego's frame; None where the peaks do not give one."""
-    settings = np.array(list(vars(config).values()), dtype=np.float64)
+    settings = ShiftSettings(**{name: getattr(config, name) for name in ShiftSettings._fields})
     partner, mode = np.empty(len(sender.center), np.int64), np.empty(2)
     if not _shift_kernels.find_mode(ego.center, ego.weight, sender.center, sender.weight, settings, mode):
         return None
