@@ -133,6 +133,7 @@ def test_a_geopackage_in_metres_holds_the_same_places_with_a_style_of_each_layer
             want = shapely.LineString(m.elements.polyline(row))
             assert shapely.hausdorff_distance(placed[name], want) < 0.002
     if crs == "local":
+        assert lines.crs.name == "manyeyes_local"
         np.testing.assert_array_equal(shapely.get_coordinates(lines.geometry[0]), m.elements.polyline(0))
     with closing(sqlite3.connect(path)) as data:
         styles = dict(data.execute("SELECT f_table_name, styleQML FROM layer_styles WHERE useAsDefault = 1").fetchall())

@@ -38,7 +38,7 @@ def write_geopackage(vector_map: VectorMap, path: Path | str, crs: str = "EPSG:4
     except ImportError:
         raise MissingExtraError("map", "Maps as GeoPackage") from None
     placed = _place(vector_map, crs)
-    stated = vector_map.frame.proj if crs == "local" else crs
+    stated = f"{vector_map.frame.proj} +title=manyeyes_local" if crs == "local" else crs
     geometry = shapely.to_wkb(to_shapely(shapely, placed))
     columns = list(Attributes.of(vector_map).columns())
     fields = [name for name, _ in columns]
