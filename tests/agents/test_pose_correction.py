@@ -356,6 +356,18 @@ def test_without_common_objects_the_more_certain_of_prior_and_propagated_pose_is
     assert off == pytest.approx(sigma) if is_stated else off < 0.2
 
 
+def test_a_measured_pose_too_uncertain_to_be_used_is_still_propagated() -> None:
+    """The pose of the first message is not used, and yet rejects the false one of the second."""
+    world = cars(12, 13)
+    false = shifted(world, 30.0, 5.0)
+    strict = PoseCorrection(max_sigma_m=0.01)
+    first = strict.correct(frame(), cache_of(world), [message_of(world, OTHERS[0], off=(1.0, 0.0, 0.0))], {})
+    assert first.corrections[0].use is MessageUse.UNCERTAIN and not first.messages
+    now = message_of(world, OTHERS[0], off=(-1.0, 0.0, 0.0), time_ns=100_000_000)
+    (second,) = PoseCorrection().correct(frame(100_000_000), cache_of(false), [now], first.states).corrections
+    assert second.estimate.status is PoseStatus.AMBIGUOUS and second.health.num_frames == 1
+
+
 def test_the_state_of_a_sender_that_left_expires() -> None:
     world, strange = cars(10, 12), cars(10, 11)
     messages = [message_of(world, OTHERS[0], sigma=0.2), message_of(strange, OTHERS[1], agent_id=3, sigma=0.2)]

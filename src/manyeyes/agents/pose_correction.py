@@ -94,7 +94,7 @@ class CorrectionOutcome:
 
 @dataclass(frozen=True)
 class SenderState:
-    """State of one sender, or of the ego itself. last_corrected: its last message with a corrected pose that is consistent with the
+    """State of one sender, or of the ego itself. last_corrected: its last message at an estimated pose that is consistent with the
     prior. body: where its vehicle is in its frame, estimated where it is not stated.
     """
 
@@ -202,8 +202,9 @@ class PoseCorrection:
             if use is MessageUse.INCONSISTENT or estimate.status is PoseStatus.CONFLICT:
                 # Do not propagate from a pose that conflicts with the prior: an error would persist.
                 last = None
-            elif use is MessageUse.CORRECTED:
-                last = kept[-1]
+            elif use is MessageUse.CORRECTED or pairwise_estimates[n].status.has_estimate:
+                # Also where the estimate is too uncertain to be used: with the next one it may be certain enough.
+                last = apply_correction(message, frame, estimate)
             elif n in propagated:
                 # The prior is not part of it: what is propagated stays independent of it.
                 last = apply_correction(message, frame, no_estimate(propagated[n]))
