@@ -368,6 +368,14 @@ def test_a_measured_pose_too_uncertain_to_be_used_is_still_propagated() -> None:
     assert second.estimate.status is PoseStatus.AMBIGUOUS and second.health.num_frames == 1
 
 
+def test_the_propagated_pose_takes_the_place_of_a_certain_prior_whose_sender_had_an_offset() -> None:
+    world = cars(12, 13)
+    steps = [*([(world, world, 2.0)] * 4), (world, world, 0.0), (cars(9, 2), world, 0.0)]
+    (*_, (last, off)) = corrections_after(steps, 0.05)
+    assert last.health.health is PoseHealth.OFFSET
+    assert last.use is MessageUse.CORRECTED and off < 0.2
+
+
 def test_the_state_of_a_sender_that_left_expires() -> None:
     world, strange = cars(10, 12), cars(10, 11)
     messages = [message_of(world, OTHERS[0], sigma=0.2), message_of(strange, OTHERS[1], agent_id=3, sigma=0.2)]

@@ -182,7 +182,7 @@ class PoseCorrection:
             self._update_monitor(new_states, bodies, message, prior, estimate)
             for message, prior, estimate in zip(messages, priors, pairwise_estimates)
         ]
-        at_propagated = self._use_propagated(own, landmarks, priors, pairwise_estimates, propagated)
+        at_propagated = self._use_propagated(own, landmarks, priors, pairwise_estimates, propagated, health)
         bodies = self._update_bodies(frame, messages, (own, *landmarks), pairwise_estimates, bodies)
         joint, inconsistent = self._optimize_jointly(messages, (own, *landmarks), priors, pairwise_estimates)
         kept, corrections = [], []
@@ -315,9 +315,10 @@ class PoseCorrection:
         priors: list[PosePrior | None],
         estimates: list[PoseEstimate],
         propagated: Mapping[int, PosePrior],
+        health: Sequence[PoseReport],
     ) -> set[int]:
         """Match again with the propagated priors where nothing was measured, and put these and the new estimates in place where
-        they are better; returns the rows of these.
+        they are better, as where the stated priors have an offset or a drift; returns the rows of these.
         """
         used = set[int]()
         for n, prior in propagated.items():
@@ -326,7 +327,8 @@ class PoseCorrection:
             estimate = load_corrector(self.corrector)(own, landmarks[n], prior)
             if contradicts_both(estimate, priors[n], prior):
                 estimate = no_estimate(prior, PoseStatus.AMBIGUOUS)
-            if estimate.status.has_estimate or not self._supports_stated(priors[n], prior):
+            is_faulty = health[n].health in _FAULTY
+            if estimate.status.has_estimate or is_faulty or not self._supports_stated(priors[n], prior):
                 priors[n], estimates[n] = prior, estimate
                 used.add(n)
         return used
