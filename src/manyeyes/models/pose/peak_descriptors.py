@@ -119,7 +119,5 @@ def _principal_axes(xy: Tensor, cells: Tensor, weight: Tensor, radius_m: float) 
     delta = cells.float() - xy[:, None]
     near = weight * (delta.square().sum(2) <= radius_m**2)
     delta = delta - (near[..., None] * delta).sum(1, keepdim=True) / near.sum(1).clamp_min(1e-6)[:, None, None]
-    xx, yy, xy_ = (
-        (near * delta[..., i] * delta[..., k]).sum(1) for i, k in ((0, 0), (1, 1), (0, 1))
-    )  # fmt: skip
-    return torch.atan2(2 * xy_, xx - yy) / 2
+    xx, yy, mixed = ((near * delta[..., i] * delta[..., k]).sum(1) for i, k in ((0, 0), (1, 1), (0, 1)))
+    return torch.atan2(2 * mixed, xx - yy) / 2
