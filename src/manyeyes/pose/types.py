@@ -23,7 +23,8 @@ class PoseStatus(Enum):
     """Result of comparing the pose measured from common objects with the prior.
 
     OK: measurement and prior agree. CORRECTED: the pose is measured; there is no prior, or the chi^2 test is inconclusive.
-    CONFLICT: the pose is measured and the prior contradicts it. AMBIGUOUS: more than one pose fits. NO_MATCH: none fits.
+    CONFLICT: the pose is measured and the prior contradicts it. AMBIGUOUS: more than one pose fits, or the one that fits
+    contradicts both the prior and the sender's propagated pose. NO_MATCH: none fits.
     """
 
     OK = "ok"
