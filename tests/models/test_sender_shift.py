@@ -135,6 +135,19 @@ def test_hostile_values_stay_bounded() -> None:
     assert float((align_senders(crowd).xy - crowd.xy).norm(dim=1).max()) < 2 * DEFAULT_SHIFT.max_shift_m
 
 
+def test_features_keep_their_gradient_when_a_moved_token_leaves_the_grid() -> None:
+    true, stated, x_max = pose(8.0, -4.0), pose(6.6, -4.0), float(GRID.x_max)
+    edge = torch.cat((OBJECTS, torch.tensor([[x_max + 0.7 + 0.5 * GRID.cell_size_m, 0.0]])))
+    part = sender(true, stated, edge)
+    part = replace(part, tokens=part.tokens.requires_grad_())
+    before = tokens_of(agent(OBJECTS), part)
+    after = align_senders(before)
+    assert len(after.xy) < len(before.xy) == len(OBJECTS) + len(edge)
+    after.features.sum().backward()
+    assert part.tokens.grad is not None
+    assert part.tokens.grad[: len(OBJECTS), :CHANNELS].eq(1).all() and not part.tokens.grad[-1].any()
+
+
 def slow_shift(ego: Peaks, other: Peaks, origin: np.ndarray) -> tuple[np.ndarray, int] | None:
     """The estimate (3,) and its pairs, in loops."""
     c, near = DEFAULT_SHIFT, lambda d: d @ d <= DEFAULT_SHIFT.max_shift_m**2

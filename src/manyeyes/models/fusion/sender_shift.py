@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from manyeyes.models.detector.box_head import BOX_LAYOUT
 from manyeyes.models.detector.proposal import proposed_heat, proposed_offset
@@ -132,13 +132,19 @@ def find_peaks(xy: F64, heat: F64, sigma: F64, config: ShiftConfig = DEFAULT_SHI
 def align_senders(tokens: Tokens, config: ShiftConfig = DEFAULT_SHIFT) -> Tokens:
     """Return the tokens with those of each sender moved by its estimated correction, and the position sigma that is left.
 
-    Tokens of senders without an estimate, and the ego's own current ones, stay as they are. There is no gradient to positions.
+    Tokens of senders without an estimate, and the ego's own current ones, stay as they are. There is no gradient to positions;
+    that of features stays.
     """
     with torch.no_grad():
-        return _align(tokens, config)
+        places, pose_context = _find_places(tokens, config)
+        inside = (tokens.sender == 0) | tokens.grid.contains(places)
+        rows = None if bool(inside.all()) else inside.nonzero()[:, 0]
+    aligned = replace(tokens, xy=places, pose_context=pose_context)
+    return aligned if rows is None else aligned.select(rows)
 
 
-def _align(tokens: Tokens, config: ShiftConfig) -> Tokens:
+def _find_places(tokens: Tokens, config: ShiftConfig) -> tuple[Tensor, Tensor]:
+    """Return the corrected positions and pose contexts."""
     cell_m = tokens.grid.cell_size_m
     offset = proposed_offset(tokens.proposal)
     follows = (offset.abs().amax(1) <= MAX_OFFSET_CELLS)[:, None]
@@ -167,9 +173,7 @@ def _align(tokens: Tokens, config: ShiftConfig) -> Tokens:
     pose_context[:, 3] = torch.from_numpy(left).to(pose_context)
     changed = torch.from_numpy((moved != xy).any(1)).to(tokens.xy.device)
     places = torch.where(changed[:, None], torch.from_numpy(moved).to(tokens.xy), tokens.xy)
-    aligned = replace(tokens, xy=places, pose_context=torch.where(changed[:, None], pose_context, tokens.pose_context))
-    inside = (tokens.sender == 0) | tokens.grid.contains(places)
-    return aligned if bool(inside.all()) else aligned.select(inside.nonzero()[:, 0])
+    return places, torch.where(changed[:, None], pose_context, tokens.pose_context)
 
 
 def _origin(xy: F64, sender_xy: F64, context: F64) -> F64:
