@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from tests.agents.trust.street import (
@@ -30,6 +32,16 @@ HONEST, MALICIOUS, NORMAL = cars(SEEN, SEEN_TOO), SenderStatus.MALICIOUS, Sender
 PRIOR = 2 / 3
 
 
+def raised(boxes: Boxes, height_m: float) -> Boxes:
+    return replace(boxes, center=boxes.center + torch.tensor([0.0, 0.0, height_m], dtype=torch.float64))
+
+
+def drop_around(points: torch.Tensor, place: tuple[float, float], radius_m: float) -> torch.Tensor:
+    """Returns (N, 3) without those of the ground around a place."""
+    near = (points[:, :2] - torch.tensor(place).double()).norm(dim=1) <= radius_m
+    return points[~near | (points[:, 2] > 0.1)]
+
+
 @pytest.fixture
 def street() -> Street:
     return Street(DETECTOR)
@@ -43,6 +55,21 @@ def test_a_car_on_ground_that_the_ego_sees_through_is_refuted_and_its_sender_nam
     third = street.run(2, claims)
     assert sender(third, 1).status is MALICIOUS and sender(third, 1).weight == 0.0
     assert DETECTOR.excluded(street.state, [1, 2], 300_000_000) == {1}
+
+
+@pytest.mark.parametrize("height_m", [-2.6, -0.7, 0.7, 2.0])
+def test_a_false_car_stated_below_or_above_the_road_is_refuted_all_the_same(street, height_m):
+    claims = {1: Boxes.cat([HONEST, raised(cars(FREE), height_m)])}
+    assert kinds(street.step(claims), 1)[2] == Evidence.REFUTED
+    assert sender(street.run(2, claims), 1).status is MALICIOUS
+
+
+def test_a_claim_as_high_as_a_bridge_or_without_flat_ground_around_it_is_not_checked(street):
+    assert kinds(street.step({1: raised(cars(FREE), 6.0)}), 1) == [Evidence.UNCHECKED]
+    # A car in a hollow, 2 m lower, beyond the edge of which the ego sees no ground.
+    hollow = Street(DETECTOR, spoil=lambda points, _: drop_around(points, FREE, 3.0))
+    assert kinds(Street(DETECTOR).step({1: raised(cars(FREE), -2.0)}), 1) == [Evidence.REFUTED]
+    assert kinds(hollow.step({1: raised(cars(FREE), -2.0)}), 1) == [Evidence.UNCHECKED]
 
 
 def test_an_occluded_honest_claim_costs_nothing(street):
@@ -138,6 +165,15 @@ def test_a_third_agent_of_high_trust_corroborates_what_the_ego_cannot_see(street
     claims = {1: cars(SEEN, SEEN_TOO, HIDDEN), 2: cars((15.1, 0.1), (12.1, 12.1), (30.4, 15.2))}
     assert kinds(street.step(claims), 1)[2] == Evidence.CORROBORATED
     assert kinds(Street(DETECTOR).step(claims), 1)[2] == Evidence.UNCHECKED
+
+
+def test_a_weak_claim_of_a_third_agent_neither_corroborates_nor_disputes(street):
+    street.run(5, {1: HONEST, 2: HONEST})
+    weak = Boxes.cat([cars((15.1, 0.1), (12.1, 12.1)), cars((30.4, 15.2), (12.3, -6.2), score=0.45)])
+    claims = {1: cars(SEEN, SEEN_TOO, HIDDEN, FREE), 2: weak}
+    assert kinds(street.step(claims), 1)[2:] == [Evidence.UNCHECKED, Evidence.REFUTED]
+    found = street.run(2, claims)
+    assert sender(found, 1).status is MALICIOUS and sender(found, 2).status is NORMAL
 
 
 def test_trust_decays_to_the_prior(street):

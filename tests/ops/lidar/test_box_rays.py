@@ -3,11 +3,18 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
 from manyeyes.datatypes import Boxes
-from manyeyes.ops.lidar.box_rays import count_box_rays, count_box_rays_reference
+from manyeyes.ops.lidar.box_rays import (
+    MAX_RAISED_M,
+    MIN_GROUND_RETURNS,
+    count_box_rays,
+    count_box_rays_reference,
+    place_on_ground,
+)
 
 ORIGIN = torch.tensor([0.0, 0.0, 2.0])
 CAR = Boxes.of([[10.0, 0.0, 1.0]], [[4.0, 2.0, 2.0]], [0.0])
@@ -61,3 +68,17 @@ def test_no_points_and_no_boxes():
     none = count_box_rays(torch.zeros(0, 3), ORIGIN, CAR, torch.tensor([0.3]))
     assert none.num_passing.tolist() == none.num_hits.tolist() == [0]
     assert len(count_box_rays(torch.zeros(5, 3), ORIGIN, Boxes.empty(), torch.zeros(0)).num_hits) == 0
+
+
+def test_a_box_off_the_ground_is_set_on_it_where_the_ground_is_seen():
+    ground = np.array([[10.0 + k, 0.5, 0.05] for k in (-2, -1, 0, 1, 2)], np.float32)
+    assert len(ground) == MIN_GROUND_RETURNS
+    bases = np.array([-2.5, -0.31, -0.29, 0.0, 0.29, 1.0, MAX_RAISED_M + 0.1])
+    boxes = np.tile([10.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.3], (len(bases), 1))
+    boxes[:, 2] = 0.75 + bases
+    placed = place_on_ground(ground, boxes)
+    assert placed[:, 2].tolist() == pytest.approx([0.75, 0.75, 0.46, 0.75, 1.04, 0.75, 0.85 + MAX_RAISED_M])
+    assert np.array_equal(np.delete(placed, 2, axis=1), np.delete(boxes, 2, axis=1))
+    # Too few returns of the ground, returns from elsewhere, or from higher up: nothing moves.
+    for returns in (ground[1:], ground + np.float32([6, 0, 0]), ground + np.float32([0, 0, 1]), ground[:0]):
+        assert np.array_equal(place_on_ground(returns, boxes), boxes)

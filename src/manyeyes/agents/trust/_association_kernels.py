@@ -50,12 +50,19 @@ def nearest_rows(one: F64x2, other: F64x2, radius_m: float) -> I64x1:  # pragma:
 
 @njit(cache=True, nogil=True)
 def match_claims(
-    xy: F64x2, gate_m: F64x1, first: I64x1, own: F64x2, is_trusted: Boolx1, copy_m: float, max_copied: float
+    xy: F64x2,
+    gate_m: F64x1,
+    is_likely: Boolx1,
+    first: I64x1,
+    own: F64x2,
+    is_trusted: Boolx1,
+    copy_m: float,
+    max_copied: float,
 ) -> tuple[Boolx1, Boolx1]:  # pragma: no cover
-    """Return (N,) which claims match one of the ego's detections (K, 2), and which match a claim of a trusted third agent.
+    """Return (N,) which claims match one of the ego's detections (K, 2), and which match a likely claim of a trusted third agent.
 
-    xy (N, 2), gate_m (N,): claims of all senders, one after the other; first: (S + 1,) of each sender. A third agent that states
-    more than max_copied of the claims within copy_m is no other source.
+    xy (N, 2), gate_m (N,), is_likely (N,): claims of all senders, one after the other; first: (S + 1,) of each sender. A third agent
+    that states more than max_copied of the claims within copy_m is no other source.
     """
     is_own, is_corroborated = np.zeros(len(xy), np.bool_), np.zeros(len(xy), np.bool_)
     for n in range(len(first) - 1):
@@ -73,7 +80,8 @@ def match_claims(
             equal = find_partners(xy[begin:end], third, np.full(end - begin, copy_m)) >= 0
             if fewest >= 2 and equal.sum() > max_copied * fewest:
                 continue
-            is_corroborated[begin:end] |= find_partners(xy[begin:end], third, gate_m[begin:end]) >= 0
+            likely = third[is_likely[first[k] : first[k + 1]]]
+            is_corroborated[begin:end] |= find_partners(xy[begin:end], likely, gate_m[begin:end]) >= 0
     return is_own, is_corroborated
 
 

@@ -19,7 +19,7 @@ from manyeyes.agents.trust.association import Floats
 from manyeyes.agents.trust.claims import Claims
 from manyeyes.agents.trust.interface import Evidence
 from manyeyes.datatypes import AgentFrame
-from manyeyes.ops.lidar.box_rays import count_rays_of_columns
+from manyeyes.ops.lidar.box_rays import count_rays_of_columns, place_on_ground
 
 Kinds = NDArray[np.uint8]
 # Members of an enumeration are slow to read.
@@ -34,7 +34,8 @@ class ClaimCheckConfig:
     min_own_score: of a detection of the ego that supports a claim. gate_m: of a match, beyond two
     standard deviations. max_range_m: of ray tests. margin_m: of a box in a ray test, beyond the larger of min_sigma_m and its
     standard deviation; max_margin_m: no test beyond. min_passing: rays that refute, if they are also passing_ratio times the hits.
-    min_hits: returns that support. min_corroborating_trust: of a third agent. max_copied: fraction of equal boxes of two senders,
+    min_hits: returns that support. min_corroborating_trust, min_corroborating_score: of a third agent, and of its claim; weaker claims
+    are often errors, beside which a false claim would seem to be true. max_copied: fraction of equal boxes of two senders,
     within copy_m, above which they are one source.
     """
 
@@ -48,6 +49,7 @@ class ClaimCheckConfig:
     passing_ratio: float = 4.0
     min_hits: int = 5
     min_corroborating_trust: float = 0.8
+    min_corroborating_score: float = 0.5
     max_copied: float = 0.6
     copy_m: float = 0.02
 
@@ -90,8 +92,9 @@ def check_claims(
     columns = np.concatenate([np.zeros((0, 7)), *(one.columns for one in claims)])
     sigma_m, xy = np.concatenate([np.zeros(0), *(one.sigma_m for one in claims)]), columns[:, :2].copy()
     is_trusted = np.array([trust.get(one.agent_id, 0.0) >= config.min_corroborating_trust for one in claims], np.bool_)
+    is_likely = np.concatenate([np.zeros(0), *(one.score for one in claims)]) >= config.min_corroborating_score
     gates, places = config.gate_m + 2 * sigma_m, np.ascontiguousarray(own)
-    is_own, is_third = match_claims(xy, gates, sizes, places, is_trusted, config.copy_m, config.max_copied)
+    is_own, is_third = match_claims(xy, gates, is_likely, sizes, places, is_trusted, config.copy_m, config.max_copied)
     kinds = is_own * np.uint8(_SUPPORTED)
     rays = _check_rays(frame, columns, sigma_m, kinds, config, probes)
     kinds[is_third & (kinds == _UNCHECKED)] = _CORROBORATED
@@ -120,9 +123,11 @@ def _check_rays(
     margin = config.margin_m + np.maximum(sigma_m, config.min_sigma_m)
     is_near = np.hypot(columns[:, 0], columns[:, 1]) <= config.max_range_m
     tested = np.flatnonzero((kinds == _UNCHECKED) & is_near & (margin <= config.max_margin_m))
-    boxes, margins = columns[tested], margin[tested]
+    # Heights of claims are those that the sender states, in the plane of its own ground.
+    xyz, margins = frame.points.xyz.numpy(), margin[tested]
+    boxes = place_on_ground(xyz, columns[tested])
     if len(probes):
         boxes, margins = np.concatenate((boxes, probes)), np.concatenate((margins, np.zeros(len(probes))))
-    rays = count_rays_of_columns(frame.points.xyz.numpy(), frame.sensor_height_m, boxes, margins)
+    rays = count_rays_of_columns(xyz, frame.sensor_height_m, boxes, margins)
     kinds[tested] = classify_rays(rays[: len(tested)], config)
     return rays[len(tested) :]

@@ -115,3 +115,25 @@ def count_rays(points: F32x2, origin: F64x1, boxes: F64x2, margin_m: F64x1, limi
                     if (1.0 - leave) * length >= behind:
                         out[k, 0] += 1
     return out
+
+
+@njit(cache=True, nogil=True)
+def place_on_ground(points: F32x2, boxes: F64x2, limits: F64x1) -> F64x2:  # pragma: no cover
+    """Return boxes (K, 7) of which those off the ground z = 0 are set on it where returns (N, 3) show it around them.
+
+    limits: the constants of ``box_rays``, in order.
+    """
+    tolerance, highest, radius, min_returns = limits
+    out = boxes.copy()
+    for k in range(len(boxes)):
+        base = abs(boxes[k, 2] - boxes[k, 5] / 2)
+        if not tolerance < base <= highest:
+            continue
+        count = 0
+        for i in range(len(points)):
+            if abs(points[i, 2]) <= tolerance:
+                dx, dy = points[i, 0] - boxes[k, 0], points[i, 1] - boxes[k, 1]
+                count += dx * dx + dy * dy <= radius * radius
+        if count >= min_returns:
+            out[k, 2] = boxes[k, 5] / 2
+    return out

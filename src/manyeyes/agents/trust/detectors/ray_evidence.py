@@ -266,7 +266,9 @@ class RayEvidenceDetector(MisbehaviourDetector):
             is_refuted, tracks = one.kinds == _REFUTED, _memory(now, one.claims.agent_id).tracks
             if not is_refuted.any() and not tracks.refuted_ns.any():
                 continue
-            is_supported, disputed = one.kinds == _SUPPORTED, is_refuted & one.corroborated
+            # A weak claim counts against nobody, so that nobody's claim beside it needs protection.
+            is_likely = one.claims.score >= self.evidence.min_corroborating_score
+            is_supported, disputed = one.kinds == _SUPPORTED, is_refuted & one.corroborated & is_likely
             if len(tracks):
                 rows = check.track.clip(0)
                 turned = is_refuted & self._is_recent(tracks.supported_ns[rows], now.now_ns)
