@@ -61,8 +61,8 @@ def match_claims(
 ) -> tuple[Boolx1, Boolx1]:  # pragma: no cover
     """Return (N,) which claims match one of the ego's detections (K, 2), and which match a likely claim of a trusted third agent.
 
-    xy (N, 2), gate_m (N,), is_likely (N,): claims of all senders, one after the other; first: (S + 1,) of each sender. A third agent
-    that states more than max_copied of the claims within copy_m is no other source.
+    xy (N, 2), gate_m (N,), is_likely (N,): claims of all senders, one after the other; first: (S + 1,) of each sender. A third
+    agent that states more than max_copied of the claims within copy_m is no other source.
     """
     is_own, is_corroborated = np.zeros(len(xy), np.bool_), np.zeros(len(xy), np.bool_)
     for n in range(len(first) - 1):

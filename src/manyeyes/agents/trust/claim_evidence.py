@@ -34,9 +34,9 @@ class ClaimCheckConfig:
     min_own_score: of a detection of the ego that supports a claim. gate_m: of a match, beyond two
     standard deviations. max_range_m: of ray tests. margin_m: of a box in a ray test, beyond the larger of min_sigma_m and its
     standard deviation; max_margin_m: no test beyond. min_passing: rays that refute, if they are also passing_ratio times the hits.
-    min_hits: returns that support. min_corroborating_trust, min_corroborating_score: of a third agent, and of its claim; weaker claims
-    are often errors, beside which a false claim would seem to be true. max_copied: fraction of equal boxes of two senders,
-    within copy_m, above which they are one source.
+    min_hits: returns that support. min_corroborating_trust, min_corroborating_score: of a third agent, and of its claim; weaker
+    claims are often errors, beside which a false claim would seem to be true. max_copied: fraction of equal boxes of two
+    senders, within copy_m, above which they are one source.
     """
 
     min_own_score: float = 0.3

@@ -25,8 +25,8 @@ MIN_BEHIND_M = 0.5
 """A ray passes if it returns from at least this far behind the core of a box."""
 _LIMITS = np.array([BOTTOM_M, TOP_M, MIN_BEHIND_M])
 GROUND_M, MAX_RAISED_M = 0.3, 4.0
-"""Ground is within GROUND_M of z = 0. A box farther off it than that, and at most MAX_RAISED_M, is set on it; beyond, it may stand on
-a bridge, or below one."""
+"""Ground is within GROUND_M of z = 0. A box farther off it than that, and at most MAX_RAISED_M, is set on it; beyond, it may stand
+on a bridge, or below one."""
 GROUND_RADIUS_M, MIN_GROUND_RETURNS = 2.5, 5
 """Ground is seen at a box where so many of its returns lie within this distance of the centre."""
 _GROUND_LIMITS = np.array([GROUND_M, MAX_RAISED_M, GROUND_RADIUS_M, MIN_GROUND_RETURNS])
@@ -64,8 +64,8 @@ def count_rays_of_columns(xyz: F32x2, sensor_height_m: float, boxes: F64x2, marg
 def place_on_ground(xyz: F32x2, boxes: F64x2) -> F64x2:
     """Return boxes (K, 7: centre, size, yaw) of which those off the ground are set on it, where the returns (N, 3) show it.
 
-    Both in a levelled frame, with the ground at z = 0. A box that is stated below the ground or above it has no rays, whereas objects
-    stand on it. Where no flat ground is seen, as on slopes, boxes stay as they are.
+    Both in a levelled frame, with the ground at z = 0. A box that is stated below the ground or above it has no rays, whereas
+    objects stand on it. Where no flat ground is seen, as on slopes, boxes stay as they are.
     """
     return _box_ray_kernels.place_on_ground(np.ascontiguousarray(xyz, np.float32), boxes, _GROUND_LIMITS)
 
