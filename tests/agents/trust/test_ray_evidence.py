@@ -85,6 +85,20 @@ def test_returns_of_an_undetected_car_support_a_claim(street):
     assert kinds(street.step({1: cars(SEEN)}), 1) == [Evidence.SUPPORTED]
 
 
+def test_returns_of_a_wall_beside_a_false_car_do_not_support_it(street):
+    fence = replace(cars((12.0, -7.45)), size=torch.tensor([[9.0, 0.2, CAR[2]]]).double())
+    street.solid = Boxes.cat([street.solid, fence])
+    claims = {1: cars(SEEN, SEEN_TOO, FREE)}
+    assert kinds(street.step(claims), 1)[2] == Evidence.REFUTED
+    assert sender(street.run(2, claims), 1).status is MALICIOUS
+
+
+@pytest.mark.parametrize("offset", [(0.5, 0.0), (-0.5, 0.0), (0.0, 0.5), (0.0, -0.5), (0.3, 0.4)])
+def test_a_true_car_that_is_stated_half_a_metre_off_is_supported(street, offset):
+    street.own = cars(SEEN_TOO)
+    assert kinds(street.step({1: cars((SEEN[0] + offset[0], SEEN[1] + offset[1]))}), 1) == [Evidence.SUPPORTED]
+
+
 def test_low_scores_are_refuted_but_accuse_no_sender(street):
     found = street.run(10, {1: cars(FREE, score=0.45)})
     assert kinds(found, 1) == [Evidence.REFUTED]

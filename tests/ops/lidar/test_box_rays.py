@@ -35,6 +35,7 @@ def test_loops_equal_the_reference(seed):
     origin = torch.tensor([0.4, -0.3, 1.9])
     fast, slow = (f(points, origin, boxes, margin) for f in (count_box_rays, count_box_rays_reference))
     assert torch.equal(fast.num_passing, slow.num_passing) and torch.equal(fast.num_hits, slow.num_hits)
+    assert torch.equal(fast.num_inner, slow.num_inner) and 50 < int(fast.num_inner.sum()) < int(fast.num_hits.sum())
     assert int(fast.num_passing.sum()) > 50 and int(fast.num_hits.sum()) > 50
 
 

@@ -33,7 +33,8 @@ class ClaimCheckConfig:
 
     min_own_score: of a detection of the ego that supports a claim. gate_m: of a match, beyond two
     standard deviations. max_range_m: of ray tests. margin_m: of a box in a ray test, beyond the larger of min_sigma_m and its
-    standard deviation; max_margin_m: no test beyond. min_passing: rays that refute, if they are also passing_ratio times the hits.
+    standard deviation; max_margin_m: no test beyond. min_passing: rays that refute, if they are also passing_ratio times the
+    hits, or if no hit is an inner one: those are of a wall or another object beside the box.
     min_hits: returns that support. min_corroborating_trust, min_corroborating_score: of a third agent, and of its claim; weaker
     claims are often errors, beside which a false claim would seem to be true. max_copied: fraction of equal boxes of two
     senders, within copy_m, above which they are one source.
@@ -82,7 +83,7 @@ def check_claims(
     config: ClaimCheckConfig,
     probes: Floats,
 ) -> tuple[tuple[CheckedClaims, ...], I64x2]:
-    """Return the evidence on all claims of one frame, and passing rays and hits (P, 2) of probes.
+    """Return the evidence on all claims of one frame, and passing rays, hits and inner hits (P, 3) of probes.
 
     Args:
         own: (K, 2) metres, the ego's detections of min_own_score. trust: in each sender, before this frame.
@@ -106,9 +107,9 @@ def check_claims(
 
 
 def classify_rays(rays: I64x2, config: ClaimCheckConfig) -> Kinds:
-    """Return (K,) the evidence of passing rays and hits (K, 2) of boxes."""
-    passing, hits = rays.T
-    is_refuted = (passing >= config.min_passing) & (passing >= config.passing_ratio * hits)
+    """Return (K,) the evidence of passing rays, hits and inner hits (K, 3) of boxes."""
+    passing, hits, inner = rays.T
+    is_refuted = (passing >= config.min_passing) & ((passing >= config.passing_ratio * hits) | (inner == 0))
     is_supported = (hits >= config.min_hits) & ~is_refuted
     return (is_refuted * _REFUTED + is_supported * _SUPPORTED).astype(np.uint8)
 

@@ -102,8 +102,8 @@ def make_probes(unclaimed: OwnObjects, sender_xy: tuple[float, float], config: O
 
 
 def is_in_sight(rays: I64x2, config: OmissionConfig) -> bool:
-    """Return whether the ego has returns of an object, and sees through all of its line of sight; rays (P, 2) of the probes."""
+    """Return whether the ego has returns of an object, and sees through all of its line of sight; rays (P, 3) of the probes."""
     if not len(rays):
         return False
-    passing, hits = rays.T
+    passing, hits, _ = rays.T
     return bool(hits[0] >= config.min_returns and (passing[1:] > 0).all() and (hits[1:] == 0).all())

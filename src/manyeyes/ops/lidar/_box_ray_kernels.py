@@ -57,15 +57,18 @@ def _find_nearest_m(origin: F64x1, box: F64x1, margin_m: float) -> float:  # pra
 
 @njit(cache=True, nogil=True)
 def count_rays(points: F32x2, origin: F64x1, boxes: F64x2, margin_m: F64x1, limits: F64x1) -> I64x2:  # pragma: no cover
-    """Return (K, 2), passing rays and hits of boxes (K, 7: centre, size, yaw). limits: the constants of ``box_rays``, in order."""
-    out = np.zeros((len(boxes), 2), np.int64)
+    """Return (K, 3), passing rays, hits and inner hits of boxes (K, 7: centre, size, yaw).
+
+    limits: the constants of ``box_rays``, in order.
+    """
+    out = np.zeros((len(boxes), 3), np.int64)
     if len(boxes) == 0 or len(points) == 0:
         return out
     min_m = math.inf
     for k in range(len(boxes)):
         min_m = min(min_m, _find_nearest_m(origin, boxes[k], margin_m[k]))
     order, first = sort_by_direction(points, origin, min_m)
-    bottom, top, behind = limits[0], limits[1], limits[2]
+    bottom, top, behind, edge = limits[0], limits[1], limits[2], limits[3]
     low, high, start, step = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for k in range(len(boxes)):
         cosine, sine = math.cos(boxes[k, 6]), math.sin(boxes[k, 6])
@@ -73,6 +76,7 @@ def count_rays(points: F32x2, origin: F64x1, boxes: F64x2, margin_m: F64x1, limi
         start[0], start[1], start[2] = dx * cosine + dy * sine, dy * cosine - dx * sine, origin[2] - boxes[k, 2]
         half_length, half_width, half_height = boxes[k, 3] / 2, boxes[k, 4] / 2, boxes[k, 5] / 2
         reach_x, reach_y = half_length + margin_m[k], half_width + margin_m[k]
+        inner_x, inner_y = max(reach_x - edge, half_length), max(reach_y - edge, half_width)
         if abs(start[0]) <= reach_x and abs(start[1]) <= reach_y:
             continue
         high[0], high[1], high[2] = half_length - margin_m[k], half_width - margin_m[k], half_height - top
@@ -99,6 +103,7 @@ def count_rays(points: F32x2, origin: F64x1, boxes: F64x2, margin_m: F64x1, limi
                 x, y, z = dx * cosine + dy * sine, dy * cosine - dx * sine, points[i, 2] - boxes[k, 2]
                 if abs(x) <= reach_x and abs(y) <= reach_y and low[2] <= z <= half_height + top:
                     out[k, 1] += 1
+                    out[k, 2] += abs(x) <= inner_x and abs(y) <= inner_y
                 if not has_core:
                     continue
                 step[0], step[1], step[2] = x - start[0], y - start[1], z - start[2]

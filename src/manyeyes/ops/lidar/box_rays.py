@@ -23,7 +23,9 @@ BOTTOM_M, TOP_M = 0.4, 0.3
 from BOTTOM_M above its bottom to TOP_M above its top."""
 MIN_BEHIND_M = 0.5
 """A ray passes if it returns from at least this far behind the core of a box."""
-_LIMITS = np.array([BOTTOM_M, TOP_M, MIN_BEHIND_M])
+EDGE_M = 0.3
+"""Hits nearer to the edge of an enlarged footprint may be of something beside the box, and are no inner hits."""
+_LIMITS = np.array([BOTTOM_M, TOP_M, MIN_BEHIND_M, EDGE_M])
 GROUND_M, MAX_RAISED_M = 0.3, 4.0
 """Ground is within GROUND_M of z = 0. A box farther off it than that, and at most MAX_RAISED_M, is set on it; beyond, it may stand
 on a bridge, or below one."""
@@ -33,10 +35,13 @@ _GROUND_LIMITS = np.array([GROUND_M, MAX_RAISED_M, GROUND_RADIUS_M, MIN_GROUND_R
 
 
 class BoxRays(NamedTuple):
-    """Rays of K boxes. num_passing: (K,) int64, through the core, from behind it. num_hits: (K,) int64, from the hull."""
+    """Rays of K boxes. num_passing: (K,) int64, through the core, from behind it. num_hits: (K,) int64, from the hull; num_inner:
+    (K,) int64, those EDGE_M or more inside it, or in the box itself.
+    """
 
     num_passing: Tensor
     num_hits: Tensor
+    num_inner: Tensor
 
 
 def count_box_rays(points: Tensor, origin: Tensor, boxes: Boxes, margin_m: Tensor) -> BoxRays:
@@ -51,12 +56,11 @@ def count_box_rays(points: Tensor, origin: Tensor, boxes: Boxes, margin_m: Tenso
     columns = torch.cat((boxes.center, boxes.size, boxes.yaw[:, None]), 1).double().numpy()
     xyz = np.ascontiguousarray(points.float().numpy())
     found = count_rays(xyz, origin.double().numpy(), columns, margin_m.double().numpy(), _LIMITS)
-    passing, hits = torch.from_numpy(found).unbind(1)
-    return BoxRays(passing, hits)
+    return BoxRays(*torch.from_numpy(found).unbind(1))
 
 
 def count_rays_of_columns(xyz: F32x2, sensor_height_m: float, boxes: F64x2, margin_m: F64x1) -> I64x2:
-    """Return (K, 2), passing rays and hits, of boxes (K, 7: centre, size, yaw) and returns (N, 3), of an agent's LiDAR."""
+    """Return (K, 3), passing rays, hits and inner hits, of boxes (K, 7: centre, size, yaw) and returns (N, 3) of a LiDAR."""
     origin = np.array([0.0, 0.0, sensor_height_m])
     return count_rays(np.ascontiguousarray(xyz, np.float32), origin, boxes, margin_m, _LIMITS)
 
@@ -72,7 +76,7 @@ def place_on_ground(xyz: F32x2, boxes: F64x2) -> F64x2:
 
 def count_box_rays_reference(points: Tensor, origin: Tensor, boxes: Boxes, margin_m: Tensor) -> BoxRays:
     """Do the same with every ray of every box: the slab test of Kay and Kajiya (SIGGRAPH 1986)."""
-    passing, hits = list[int](), list[int]()
+    passing, hits, inner = list[int](), list[int](), list[int]()
     for row in range(len(boxes)):
         cosine, sine = boxes.yaw[row].double().cos(), boxes.yaw[row].double().sin()
         turn = torch.stack((torch.stack((cosine, sine)), torch.stack((-sine, cosine))))
@@ -82,11 +86,12 @@ def count_box_rays_reference(points: Tensor, origin: Tensor, boxes: Boxes, margi
         )
         half = boxes.size[row].double() / 2
         if (start[0, :2].abs() <= half[:2] + margin_m[row]).all():
-            passing.append(0)
-            hits.append(0)
+            for counts in (passing, hits, inner):
+                counts.append(0)
             continue
-        is_hit = (end[:, :2].abs() <= half[:2] + margin_m[row]).all(1)
-        hits.append(int((is_hit & (end[:, 2] >= BOTTOM_M - half[2]) & (end[:, 2] <= half[2] + TOP_M)).sum()))
+        is_high = (end[:, 2] >= BOTTOM_M - half[2]) & (end[:, 2] <= half[2] + TOP_M)
+        for counts, margin in ((hits, margin_m[row]), (inner, (margin_m[row] - EDGE_M).clamp_min(0))):
+            counts.append(int(((end[:, :2].abs() <= half[:2] + margin).all(1) & is_high).sum()))
         high = torch.cat((half[:2] - margin_m[row], half[2:] - TOP_M))
         low = torch.cat((-high[:2], BOTTOM_M - half[2:]))
         step = end - start
@@ -94,5 +99,4 @@ def count_box_rays_reference(points: Tensor, origin: Tensor, boxes: Boxes, margi
         enter, leave = torch.minimum(one, two).amax(1).clamp_min(0), torch.maximum(one, two).amin(1).clamp_max(1)
         is_passing = (enter < leave) & ((1 - leave) * step.norm(dim=1) >= MIN_BEHIND_M) & (high > low).all()
         passing.append(int(is_passing.sum()))
-    counts = torch.tensor((passing, hits), dtype=torch.int64, device=points.device)
-    return BoxRays(counts[0], counts[1])
+    return BoxRays(*torch.tensor((passing, hits, inner), dtype=torch.int64, device=points.device))
