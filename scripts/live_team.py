@@ -145,7 +145,12 @@ def make_frames(config: TeamConfig, agent_id: int, clock: LiveClock, control: _C
         from manyeyes.runtime.sources import play_recording
 
         recording = open_recording(Path(config.recording[0]), config.recording[1])
-        scenario = recording.scenarios[0]
+        large = (name for name in recording.scenarios if len(recording.agents(name)) >= config.num_agents)
+        scenario = next(large, None)
+        if scenario is None:
+            raise SystemExit(
+                f"{config.recording[0]}: no scenario has {config.num_agents} agents; take fewer with --agents."
+            )
         clouds = list(play_recording(recording, scenario, recording.agents(scenario)[agent_id - 1], 0, 10))
     generator, number = torch.Generator().manual_seed(agent_id), 0
     stamp_ns = -(-clock.now_ns() // FRAME_NS) * FRAME_NS
