@@ -4,7 +4,8 @@
     python benchmarks/trust_cost.py --data DIR --split val --out benchmarks/results/trust_cost.json
 
 Times are of the processor, so that other programs do not disturb them: medians over the same frames, with a detector run for
-each. A step is what an ego does in a frame: share, with its own detections, then perceive. AP is of every agent as ego.
+each. A step is what an ego does in a frame: share, with its own detections, then perceive. AP is of every agent as ego. Each
+method is measured alone, and beside a pose corrector.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 from pathlib import Path
 from statistics import median
 from unittest.mock import patch
@@ -24,6 +26,7 @@ import tyro
 
 from manyeyes import load_detector, open_recording
 from manyeyes.agents import replay
+from manyeyes.agents.pose_correction import PoseCorrection
 from manyeyes.agents.replay import DetectionReplay, ReplayConfig, ReplayStep
 from manyeyes.agents.trust.interface import Evidence
 from manyeyes.agents.trust.registry import get_misbehaviour_detector
@@ -42,6 +45,7 @@ class Options:
     split: str = "val"
     weights: str = "costr-small"
     methods: tuple[str, ...] = ("intermediate-temporal", "intermediate", "late")
+    correctors: tuple[str, ...] = ("off", "voting")
     misbehaviour: str = "ray-evidence"
     scenario_stride: int = 3
     frames: int = 12
@@ -52,9 +56,10 @@ class Options:
 
 @dataclass(frozen=True)
 class Row:
-    """One method. AP in percent; times in milliseconds; evidence: percent of claims of score 0.5 or more."""
+    """One method and corrector. AP in percent; times in milliseconds; evidence: percent of claims of score 0.5 or more."""
 
     method: str
+    corrector: str
     ap50_without: float
     ap50_with: float
     ap70_without: float
@@ -97,7 +102,7 @@ class Counts:
             self.kinds.update(Evidence(kind).name.lower() for kind in claims.kinds[claims.claims.score >= 0.5])
 
 
-def measure(method: str, options: Options) -> Row:
+def measure(method: str, corrector: str, options: Options) -> Row:
     """Replay some scenarios without and with the detector, frame by frame in turn."""
     detector, recording = load_detector(options.weights), open_recording(options.data, options.split)
     noise = PoseNoise(
@@ -107,9 +112,10 @@ def measure(method: str, options: Options) -> Row:
     perturb: Callable[[Snapshot], Snapshot] = partial(_add_noise, noise if is_noisy else None)
     tallies = [MetricAccumulator(method, make_own_protocol(detector)) for _ in range(2)]
     counts, share_s = Counts(), list[float]()
+    correction = None if corrector == "off" else PoseCorrection(corrector)
     for scenario in recording.scenarios[:: options.scenario_stride]:
         configs = [
-            ReplayConfig(all_egos=True, misbehaviour=found)
+            ReplayConfig(all_egos=True, pose_correction=correction, misbehaviour=found)
             for found in (None, get_misbehaviour_detector(options.misbehaviour))
         ]
         players = [DetectionReplay(method, detector, config) for config in configs]
@@ -125,6 +131,7 @@ def measure(method: str, options: Options) -> Row:
     total = max(1, sum(counts.kinds.values()))
     return Row(
         method,
+        corrector,
         *(100 * results[0].ap[0].ap, 100 * results[1].ap[0].ap),
         *(100 * results[0].ap[1].ap, 100 * results[1].ap[1].ap),
         1e3 * median(share_s),
@@ -145,11 +152,14 @@ def main(options: Options) -> None:
     torch.set_num_threads(1)
     rows = list[Row]()
     with patch.object(replay, "time", _CpuClock):
-        for method in options.methods:
-            rows.append(measure(method, options))
+        for method, corrector in product(options.methods, options.correctors):
+            rows.append(measure(method, corrector, options))
             row = rows[-1]
             print(f"{row}\n  perceive x {row.perceive_ratio:.2f}, step x {row.step_ratio:.2f}", flush=True)
-    ratios = {row.method: {"perceive": row.perceive_ratio, "step": row.step_ratio} for row in rows}
+    ratios = [
+        {"method": row.method, "corrector": row.corrector, "perceive": row.perceive_ratio, "step": row.step_ratio}
+        for row in rows
+    ]
     options.out.parent.mkdir(parents=True, exist_ok=True)
     provenance.write_json(options.out, {"rows": rows, "ratios": ratios}, options, 0)
 

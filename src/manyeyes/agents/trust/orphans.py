@@ -65,7 +65,8 @@ def find_orphans(
     xy = boxes.center[:, :2].double().contiguous().numpy()
     own = cache.process(frame).boxes.center[:, :2].double().numpy()
     places = np.concatenate([own, *_list_fused_claims(assessment)])
-    is_orphan = (boxes.score > MAX_SCORE).numpy() & (find_nearest(xy, places, RADIUS_M) < 0)
+    is_orphan = (boxes.score > MAX_SCORE).numpy()
+    is_orphan[is_orphan] = find_nearest(xy[is_orphan], places, RADIUS_M) < 0
     if not is_orphan.any():
         return None
     # The newest ones are the most likely to propose what is left; at equal times the ego's own.
@@ -164,7 +165,7 @@ def _list_own_tokens(cache: PerceptionCache, frame: AgentFrame) -> list[_Source]
         found.append(_Source(None, current.shared_tokens, None, 0.0, np.eye(3), np.zeros(3)))
     for before, output in cache.previous_outputs(frame):
         if isinstance(output, TokenOutput):
-            seconds, motion = (frame.timestamp_ns - before.timestamp_ns) * 1e-9, frame.now_from_earlier(before)
+            seconds, motion = (frame.timestamp_ns - before.timestamp_ns) * 1e-9, cache.motion_since(frame, before)
             rotation, shift = motion.rotation.double().numpy(), motion.translation.double().numpy()
             found.append(_Source(None, output.shared_tokens, None, seconds, rotation, shift))
     return found

@@ -3,12 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from manyeyes.agents.trust._association_kernels import find_supporting_claims
@@ -31,16 +30,25 @@ MIN_TRUST, MAX_UNCHECKED_SCORE = 0.8, 0.49
 class ResultEvidence:
     """Evidence on N boxes of a result.
 
-    kinds: (N,) uint8 of Evidence. senders: ids of the senders whose claims each box rests on. trust: (N,) the highest trust
-    among them; 1 of own detections, 0 without any sender.
+    kinds: (N,) uint8 of Evidence. agent_ids: S senders; claims: (S, N) bool, whether a box rests on a claim of each. trust: (N,)
+    the highest trust among those; 1 of own detections, 0 without any sender.
     """
 
     kinds: Tensor
-    senders: tuple[tuple[int, ...], ...]
+    agent_ids: tuple[int, ...]
+    claims: Tensor
     trust: Tensor
 
     def __getitem__(self, rows: Tensor) -> ResultEvidence:
-        return ResultEvidence(self.kinds[rows], tuple(self.senders[row] for row in rows.tolist()), self.trust[rows])
+        return ResultEvidence(self.kinds[rows], self.agent_ids, self.claims[:, rows], self.trust[rows])
+
+    @cached_property
+    def senders(self) -> tuple[tuple[int, ...], ...]:
+        """Ids of the senders whose claims each box rests on."""
+        found: list[tuple[int, ...]] = [()] * self.claims.shape[1]
+        for sender, row in self.claims.nonzero().tolist():
+            found[row] += (self.agent_ids[sender],)
+        return tuple(found)
 
 
 def find_result_evidence(boxes: Boxes, own: Boxes, assessment: Assessment | None) -> ResultEvidence | None:
@@ -63,8 +71,8 @@ def find_result_evidence(boxes: Boxes, own: Boxes, assessment: Assessment | None
     seen = own.center[own.score >= MIN_OWN_SCORE, :2].double().numpy()
     is_own = find_nearest(xy, seen, OWN_PLACE_M) >= 0
     kinds[is_own], trust[is_own] = _OWN, 1.0
-    senders = _collect_senders([claims.agent_id for claims in used], is_near)
-    return ResultEvidence(torch.from_numpy(kinds), senders, torch.from_numpy(trust))
+    agent_ids = tuple(claims.agent_id for claims in used)
+    return ResultEvidence(torch.from_numpy(kinds), agent_ids, torch.from_numpy(is_near), torch.from_numpy(trust))
 
 
 def _list_fused_claims(assessment: Assessment) -> list[AssessedClaims]:
@@ -79,14 +87,6 @@ def _list_fused_claims(assessment: Assessment) -> list[AssessedClaims]:
     return found
 
 
-def _collect_senders(agent_ids: Sequence[int], is_near: NDArray[np.bool_]) -> tuple[tuple[int, ...], ...]:
-    """Return for each of N boxes the agents that claim it; is_near: (S, N)."""
-    found: list[tuple[int, ...]] = [()] * is_near.shape[1]
-    for sender, row in np.argwhere(is_near).tolist():
-        found[row] += (agent_ids[sender],)
-    return tuple(found)
-
-
 def bound_scores(boxes: Boxes, evidence: ResultEvidence) -> tuple[Boxes, ResultEvidence]:
     """Return the boxes with bounded scores, by falling score, and their evidence.
 
@@ -97,8 +97,10 @@ def bound_scores(boxes: Boxes, evidence: ResultEvidence) -> tuple[Boxes, ResultE
     is_disputed = kinds == _DISPUTED
     is_bounded = is_disputed | ((kinds == _UNCHECKED) & (evidence.trust.numpy() < MIN_TRUST))
     is_bounded &= boxes.score.numpy() > MAX_UNCHECKED_SCORE
-    rows = [row for row in np.flatnonzero(is_bounded).tolist() if is_disputed[row] or len(evidence.senders[row]) == 1]
-    if not rows:
+    if is_bounded.any():
+        is_bounded &= is_disputed | (evidence.claims.sum(0).numpy() == 1)
+    rows = np.flatnonzero(is_bounded)
+    if not len(rows):
         return boxes, evidence
     score = boxes.score.clone()
     score[rows] = MAX_UNCHECKED_SCORE

@@ -119,7 +119,10 @@ class RayEvidenceDetector(MisbehaviourDetector):
         now = replace(now, disputes=now.disputes.add(self._find_disputes(checked, checks, now), now.now_ns))
         if len(now.disputes.xy):
             checks = [_mark_disputed(check, now.disputes.cover(check.xy)) for check in checks]
-        counted = [_drop_minority(check, one.is_minority) for one, check in zip(checked, checks)]
+        counted = [
+            _drop_minority(check, one.is_minority) if one.is_minority.any() else check
+            for one, check in zip(checked, checks)
+        ]
         num_claims = sum(len(check.xy) for check in checks)
         senders, exclusions, assessments = dict(now.senders), now.exclusions, list[SenderAssessment]()
         for message, check, omitted, is_omitting in zip(received.messages, counted, unclaimed, omits):
