@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Print the bars of misbehaviour detection: ``python benchmarks/attack_bars.py attacks.json [false-accusations.json]``.
+"""Print the bars of misbehaviour detection, and store them as a table for documents.
+
+    python benchmarks/attack_bars.py attacks.json false-accusations.json --out benchmarks/results/attack_bars.json
 
 Each line states a bar, the measured quantity with its interval and number of samples, and whether it is met: where the whole 95 %
 interval is on the right side. "Not met" is where all of it is on the wrong side, else the result is inconclusive.
@@ -10,10 +12,15 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import tyro
+
+from manyeyes.studies import provenance
+from manyeyes.viz.study_table import StudyTable
 
 MAX_LOSS_TO_ORACLE, MAX_CLEAN_COST = 0.01, 0.003
 MIN_NAMED_5, MIN_NAMED_10, MIN_NAMED_SEEN = 0.95, 0.99, 0.80
@@ -48,10 +55,18 @@ class Measured:
             return "met"
         return "not met" if self.high < self.minimum or self.low > self.maximum else "inconclusive"
 
+    @property
+    def bound(self) -> str:
+        """Format the bound."""
+        return f">= {self.minimum:g}" if math.isfinite(self.minimum) else f"<= {self.maximum:g}"
+
+    @property
+    def spread(self) -> str:
+        """Format the value with its interval."""
+        return f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]"
+
     def __str__(self) -> str:
-        bound = f">= {self.minimum:g}" if math.isfinite(self.minimum) else f"<= {self.maximum:g}"
-        spread = f"{self.value:.4g} [{self.low:.4g}, {self.high:.4g}]"
-        return f"{self.verdict:12}  bar {self.bar}  {self.name}: {spread}, n = {self.n}; bar {bound}"
+        return f"{self.verdict:12}  bar {self.bar}  {self.name}: {self.spread}, n = {self.n}; bar {self.bound}"
 
 
 def measure_attacks(rows: list[dict[str, Any]]) -> Iterator[Measured]:
@@ -114,18 +129,46 @@ def _proportion(bar: str, name: str, stored: dict[str, Any], minimum: float) -> 
     return Measured(bar, name, value, low, value if minimum == 1.0 else stored["high"], n, minimum)
 
 
-def main() -> int:
+@dataclass(frozen=True)
+class Options:
+    """Results of the studies attacks and false-accusations, and where the table goes."""
+
+    results: tyro.conf.Positional[tuple[Path, ...]]
+    """JSON of the studies."""
+    out: Path | None = None
+    """Write the bars as JSON, for 'manyeyes report docs'."""
+
+
+def make_table(measured: Sequence[Measured]) -> StudyTable:
+    """Tabulate the bars."""
+    headings = ("bar", "quantity", "value [95 % CI]", "n", "bound", "verdict")
+    lines = tuple((m.bar, m.name, m.spread, m.n, m.bound, m.verdict) for m in measured)
+    return StudyTable("Bars of misbehaviour detection", headings, lines)
+
+
+def main(options: Options) -> int:
     """Print all bars; the exit code is 1 where one is not met."""
-    measured = list[Measured]()
-    for path in map(Path, sys.argv[1:]):
-        stored = json.loads(path.read_text(encoding="utf-8"))["result"]
-        measure = measure_accusations if stored["study"] == "false-accusations" else measure_attacks
-        measured += measure(stored["rows"])
+    measured, splits = list[Measured](), list[str]()
+    for path in options.results:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        accuses = stored["result"]["study"] == "false-accusations"
+        measured += (measure_accusations if accuses else measure_attacks)(stored["result"]["rows"])
+        if not accuses:
+            splits.append(stored["provenance"]["config"]["options"]["split"])
     measured.sort(key=lambda one: one.bar)
     sys.stdout.write("".join(f"{one}\n" for one in measured))
     sys.stdout.write("bar 6 is a test: tests/runtime/test_outsiders.py\n")
+    if options.out is not None:
+        table = make_table(measured)
+        result = {
+            "study": "attack-bars",
+            "split": ", ".join(dict.fromkeys(splits)),
+            "rows": measured,
+            "tables": [table],
+        }
+        provenance.write_json(options.out, result, options, 0)
     return int(any(one.verdict == "not met" for one in measured))
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(main(tyro.cli(Options)))

@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bars of misbehaviour detection on results written by hand."""
 
-from benchmarks.attack_bars import Measured, measure_accusations, measure_attacks
+import json
+
+from benchmarks.attack_bars import Measured, Options, main, measure_accusations, measure_attacks
+
+from manyeyes.viz.stored_tables import load_result, make_tables
 
 
 def interval(value: float, low: float, high: float) -> list[dict]:
@@ -62,3 +66,17 @@ def test_a_missing_value_is_inconclusive() -> None:
 
 def test_two_scenarios_decide_no_difference() -> None:
     assert {m.verdict for m in measure_attacks([row("copy", num_scenarios=2)])} == {"inconclusive"}
+
+
+def test_the_bars_are_stored_as_a_table_for_documents(tmp_path, capsys) -> None:
+    attacks = {
+        "provenance": {"config": {"options": {"split": "val"}}},
+        "result": {"study": "attacks", "rows": [row("none"), row("copy", vs_oracle=interval(-0.03, -0.04, -0.02))]},
+    }
+    (tmp_path / "attacks.json").write_text(json.dumps(attacks))
+    assert main(Options((tmp_path / "attacks.json",), tmp_path / "bars.json")) == 1
+    stored = load_result(tmp_path / "bars.json")
+    (table,) = make_tables(stored)
+    assert stored.split == "val" and len(table.lines) == 4
+    assert table.lines[2][1:3] == ("late, copy x1, ray-evidence: defended - oracle, AP@0.5", "-0.03 [-0.04, -0.02]")
+    assert capsys.readouterr().out.count("not met") == 1

@@ -187,6 +187,18 @@ def test_the_oracle_is_a_level_since_attacks_do_not_change_it() -> None:
     assert ">oracle: malicious agent left out<" in text and "defence: oracle" not in text and ">no attack<" in text
 
 
+def test_each_method_under_attack_has_axes_of_its_own_and_each_attack_a_line() -> None:
+    one = {"defence": "none", "num_malicious": 1, "ap": [interval(0.5)]}
+    rows = [
+        {**one, "attack": f"attack-{k}", "method": method} for method in ("late", "intermediate") for k in range(30)
+    ]
+    text = draw_figure("attacks", [stored({"rows": rows})], LIGHT)
+    assert text.count(">attack-0<") == text.count(">attack-29<") == 2 and ">late<" in text and ">intermediate<" in text
+    few = draw_figure("attacks", [stored({"rows": rows[:4]})], LIGHT)
+    heights = [float(re.search(r'height="([0-9.]+)pt"', svg)[1]) for svg in (text, few)]
+    assert heights[0] > 2 * heights[1]
+
+
 def test_a_legend_has_lines_of_equal_length() -> None:
     def draw(axes: Any, theme: Any) -> None:
         for name in ("no-fusion-temporal", "late-temporal", "intermediate-temporal", "early-temporal"):

@@ -54,12 +54,13 @@ THEMES = (
 
 @dataclass(frozen=True)
 class Panel:
-    """One pair of axes. draw: adds the data to the axes with the colours of a theme."""
+    """One pair of axes. draw: adds the data to the axes with the colours of a theme. min_height_in: for its lines, inches."""
 
     title: str
     xlabel: str
     ylabel: str
     draw: Callable[[Any, Theme], None]
+    min_height_in: float = 0.0
 
 
 def draw_svg(panels: Sequence[Panel], theme: Theme, height_in: float = 3.1) -> str:
@@ -77,6 +78,7 @@ def draw_svg(panels: Sequence[Panel], theme: Theme, height_in: float = 3.1) -> s
         "text.color": theme.text, "axes.labelcolor": theme.text, "axes.edgecolor": theme.text, "axes.titlesize": 10,
         "xtick.color": theme.text, "ytick.color": theme.text, "grid.color": theme.grid, "legend.labelcolor": theme.text,
     }  # fmt: skip
+    height_in = max(height_in, *(panel.min_height_in for panel in panels))
     with matplotlib.rc_context(settings):
         width = _PANEL_WIDTH_IN * len(panels) if len(panels) > 1 else _SINGLE_PANEL_WIDTH_IN
         figure = Figure(figsize=(width, height_in), layout="constrained")

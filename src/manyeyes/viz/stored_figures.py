@@ -16,6 +16,8 @@ _STACK_ALPHAS = (1.0, 0.74, 0.54, 0.38, 0.25)
 """Opacity of the stages of a stack, one after the other; the last is that of all shorter stages together."""
 _POINT_DISTANCE_LOG2 = 0.16
 """Between the centres of points of equal bytes, which stand side by side."""
+_ATTACK_IN = 0.26
+"""Height of the line of an attack, inches."""
 _IOUS = ("AP@0.5", "AP@0.7")
 
 
@@ -331,8 +333,13 @@ def _make_map_cost(results: Sequence[StoredResult]) -> list[Panel]:
 
 def _make_attacks(results: Sequence[StoredResult]) -> list[Panel]:
     rows = [row for stored in results for row in stored.result["rows"] if row["num_malicious"] == 1]
+    methods = list(dict.fromkeys(row["method"] for row in rows if row["method"] != "no-fusion"))
+    return [_make_attacked_method(rows, method, title=method if len(methods) > 1 else "") for method in methods]
+
+
+def _make_attacked_method(rows: Sequence[dict[str, Any]], method: str, title: str) -> Panel:
     alone = [row for row in rows if row["method"] == "no-fusion" and row["attack"] == "none"]
-    played = [row for row in rows if row["method"] != "no-fusion"]
+    played = [row for row in rows if row["method"] == method]
     attacks = list(dict.fromkeys(row["attack"] for row in played))[::-1]
     # The oracle leaves malicious agents out, whatever they send: without attack, its result is that under every attack.
     oracle = [row for row in played if row["defence"] == "oracle" and row["attack"] == "none"]
@@ -356,7 +363,7 @@ def _make_attacks(results: Sequence[StoredResult]) -> list[Panel]:
             axes.axvline(level[0]["ap"][0]["value"], color=theme.text, lw=1.2, ls=style, label=label)
         axes.set_yticks(range(len(attacks)), ["no attack" if attack == "none" else attack for attack in attacks])
 
-    return [Panel("", f"{_IOUS[0]}, 95 % interval over scenarios", "", draw)]
+    return Panel(title, f"{_IOUS[0]}, 95 % interval over scenarios", "", draw, _ATTACK_IN * len(attacks))
 
 
 def _make_malicious_agents(results: Sequence[StoredResult]) -> list[Panel]:
@@ -404,7 +411,6 @@ FIGURES = {
         "AP under attacks, by defence",
         "manyeyes study attacks --data data/carla-towns-small --split val",
         _make_attacks,
-        height_in=5.2,
     ),
     "risk-coverage": StoredFigure(
         "Risk against coverage of pose correctors without a prior",
