@@ -74,11 +74,11 @@ def test_no_points_and_no_boxes():
 def test_a_box_off_the_ground_is_set_on_it_where_the_ground_is_seen():
     ground = np.array([[10.0 + k, 0.5, 0.05] for k in (-2, -1, 0, 1, 2)], np.float32)
     assert len(ground) == MIN_GROUND_RETURNS
-    bases = np.array([-2.5, -0.31, -0.29, 0.0, 0.29, 1.0, MAX_RAISED_M + 0.1])
+    bases = np.array([-2.5, -0.51, -0.49, 0.0, 0.49, 1.0, MAX_RAISED_M + 0.1])
     boxes = np.tile([10.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.3], (len(bases), 1))
     boxes[:, 2] = 0.75 + bases
     placed = place_on_ground(ground, boxes)
-    assert placed[:, 2].tolist() == pytest.approx([0.75, 0.75, 0.46, 0.75, 1.04, 0.75, 0.85 + MAX_RAISED_M])
+    assert placed[:, 2].tolist() == pytest.approx([0.75, 0.75, 0.26, 0.75, 1.24, 0.75, 0.85 + MAX_RAISED_M])
     assert np.array_equal(np.delete(placed, 2, axis=1), np.delete(boxes, 2, axis=1))
     # Too few returns of the ground, returns from elsewhere, or from higher up: nothing moves.
     for returns in (ground[1:], ground + np.float32([6, 0, 0]), ground + np.float32([0, 0, 1]), ground[:0]):

@@ -128,11 +128,11 @@ def place_on_ground(points: F32x2, boxes: F64x2, limits: F64x1) -> F64x2:  # pra
 
     limits: the constants of ``box_rays``, in order.
     """
-    tolerance, highest, radius, min_returns = limits
+    tolerance, lowest, highest, radius, min_returns = limits
     out = boxes.copy()
     for k in range(len(boxes)):
         base = abs(boxes[k, 2] - boxes[k, 5] / 2)
-        if not tolerance < base <= highest:
+        if not lowest < base <= highest:
             continue
         count = 0
         for i in range(len(points)):

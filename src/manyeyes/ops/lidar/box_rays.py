@@ -26,12 +26,14 @@ MIN_BEHIND_M = 0.5
 EDGE_M = 0.3
 """Hits nearer to the edge of an enlarged footprint may be of something beside the box, and are no inner hits."""
 _LIMITS = np.array([BOTTOM_M, TOP_M, MIN_BEHIND_M, EDGE_M])
-GROUND_M, MAX_RAISED_M = 0.3, 4.0
-"""Ground is within GROUND_M of z = 0. A box farther off it than that, and at most MAX_RAISED_M, is set on it; beyond, it may stand
-on a bridge, or below one."""
+GROUND_M = 0.3
+"""Ground is within this distance of z = 0."""
+MIN_RAISED_M, MAX_RAISED_M = 0.5, 4.0
+"""A box is set on the ground if its bottom is farther off it than MIN_RAISED_M, more than annotated bottoms are, and at most
+MAX_RAISED_M: beyond, it may stand on a bridge, or below one."""
 GROUND_RADIUS_M, MIN_GROUND_RETURNS = 2.5, 5
 """Ground is seen at a box where so many of its returns lie within this distance of the centre."""
-_GROUND_LIMITS = np.array([GROUND_M, MAX_RAISED_M, GROUND_RADIUS_M, MIN_GROUND_RETURNS])
+_GROUND_LIMITS = np.array([GROUND_M, MIN_RAISED_M, MAX_RAISED_M, GROUND_RADIUS_M, MIN_GROUND_RETURNS])
 
 
 class BoxRays(NamedTuple):
