@@ -99,8 +99,9 @@ def test_a_true_car_that_is_stated_half_a_metre_off_is_supported(street, offset)
     assert kinds(street.step({1: cars((SEEN[0] + offset[0], SEEN[1] + offset[1]))}), 1) == [Evidence.SUPPORTED]
 
 
-def test_low_scores_are_refuted_but_accuse_no_sender(street):
-    found = street.run(10, {1: cars(FREE, score=0.45)})
+@pytest.mark.parametrize("score", [0.45, 0.75])
+def test_low_scores_are_refuted_but_accuse_no_sender(street, score):
+    found = street.run(10, {1: cars(FREE, score=score)})
     assert kinds(found, 1) == [Evidence.REFUTED]
     assert sender(found, 1).status is NORMAL and sender(found, 1).trust == pytest.approx(PRIOR)
 

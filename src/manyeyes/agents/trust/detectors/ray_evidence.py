@@ -69,12 +69,13 @@ class _Findings:
 class NamingConfig:
     """When a sender is named malicious.
 
-    min_score: of a claim that counts against its sender. min_refuted: of the last five checks of one claim. min_refuted_each: of
+    min_score: of a claim that counts against its sender: honest detectors err for seconds with scores up to 0.75, and a refuted
+    claim is removed whatever its score. min_refuted: of the last five checks of one claim. min_refuted_each: of
     the checks of each of two claims. many_claims: above so many claims of all senders in one frame, min_refuted is one more,
     since more chances of an error make more errors. sign_change_ns: a place where the evidence turns within it is disputed.
     """
 
-    min_score: float = 0.5
+    min_score: float = 0.8
     min_refuted: int = 3
     min_refuted_each: int = 2
     many_claims: int = 200
