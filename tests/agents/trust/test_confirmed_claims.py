@@ -55,12 +55,15 @@ def test_claims_of_a_named_sender_that_the_ego_or_a_third_agent_confirms_are_fus
 
 
 def test_a_result_at_a_confirmed_claim_of_a_named_sender_rests_on_it(street):
+    """Returns alone confirm nothing of a named sender: a flood of false objects finds walls to stand at."""
     street.own = cars(SEEN_TOO)
     found = street.run(5, {1: MIXED})
+    objects, _ = fused(found, street, MIXED)
+    assert objects is not None and objects.center[:, :2].tolist() == [list(SEEN_TOO)]
     evidence = find_result_evidence(MIXED, street.own, found)
     assert evidence is not None
-    assert evidence.kinds.tolist() == [Evidence.SUPPORTED, Evidence.OWN, Evidence.UNCHECKED, Evidence.UNCHECKED]
-    assert evidence.senders == ((1,), (1,), (), ())
+    assert evidence.kinds.tolist() == [Evidence.UNCHECKED, Evidence.OWN, Evidence.UNCHECKED, Evidence.UNCHECKED]
+    assert evidence.senders == ((), (1,), (), ())
 
 
 def test_nothing_is_fused_of_a_named_sender_without_confirmed_claims(street):

@@ -59,12 +59,14 @@ class ClaimCheckConfig:
 class CheckedClaims:
     """Claims of one sender (N), with evidence: kinds (N,) of Evidence.
 
-    corroborated: (N,) bool, a trusted third agent claims it too, whatever the ego's evidence is. is_minority: (N,) bool, refuted by
+    is_detected: (N,) bool, the ego detects it. corroborated: (N,) bool, a trusted third agent claims it too, whatever the ego's
+    evidence is. is_minority: (N,) bool, refuted by
     observers that are not the majority of senders: the claim is removed, and no trust changes.
     """
 
     claims: Claims
     kinds: Kinds
+    is_detected: NDArray[np.bool_]
     corroborated: NDArray[np.bool_]
     is_minority: NDArray[np.bool_]
 
@@ -100,7 +102,7 @@ def check_claims(
     rays = _check_rays(frame, columns, sigma_m, kinds, config, probes)
     kinds[is_third & (kinds == _UNCHECKED)] = _CORROBORATED
     checked = (
-        CheckedClaims(one, kinds[a:b], is_third[a:b], np.zeros(b - a, np.bool_))
+        CheckedClaims(one, kinds[a:b], is_own[a:b], is_third[a:b], np.zeros(b - a, np.bool_))
         for one, a, b in zip(claims, sizes, sizes[1:])
     )
     return tuple(checked), rays

@@ -63,10 +63,14 @@ class SenderAssessment:
 
 @dataclass(frozen=True)
 class AssessedClaims:
-    """Claims of one sender, in the ego's levelled frame at its time, and the Evidence (N,) uint8 on each."""
+    """Claims of one sender, in the ego's levelled frame at its time, and the Evidence (N,) uint8 on each.
+
+    is_detected: (N,) bool, which of the supported ones the ego detects itself: returns alone may be of a wall. None: all of them.
+    """
 
     claims: Claims
     kinds: NDArray[np.uint8]
+    is_detected: NDArray[np.bool_] | None = None
 
     @property
     def agent_id(self) -> int:
@@ -80,8 +84,11 @@ class AssessedClaims:
 
     @property
     def is_confirmed(self) -> NDArray[np.bool_]:
-        """Which claims (N,) the ego or a trusted third agent confirms."""
-        return (self.kinds == _SUPPORTED) | (self.kinds == _CORROBORATED)
+        """Which claims (N,) a detection of the ego or a trusted third agent confirms."""
+        is_supported = self.kinds == _SUPPORTED
+        if self.is_detected is not None:
+            is_supported &= self.is_detected
+        return is_supported | (self.kinds == _CORROBORATED)
 
     @property
     def evidence(self) -> Tensor:

@@ -135,7 +135,9 @@ class RayEvidenceDetector(MisbehaviourDetector):
             senders[agent_id] = memory
             is_excluded = exclusions.contains(agent_id, now.now_ns)
             assessments.append(self._assess_sender(agent_id, memory, is_excluded, is_faulty, found))
-        claims = tuple(AssessedClaims(one.claims, check.evidence) for one, check in zip(checked, checks))
+        claims = tuple(
+            AssessedClaims(one.claims, check.evidence, one.is_detected) for one, check in zip(checked, checks)
+        )
         return Assessment(
             tuple(assessments), claims, replace(now, senders=forget_oldest(senders), exclusions=exclusions)
         )
