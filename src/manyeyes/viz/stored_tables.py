@@ -116,9 +116,11 @@ def _has_no_recording(result: dict[str, Any]) -> bool:
 
 
 def _has_simulated_scenes(result: dict[str, Any]) -> bool:
-    """Return whether a result is of the step, of the cost of maps or of a study of map fusion, which simulate what they need."""
-    is_fleet = "summaries" in result or result.get("study") == "malicious-agents"
-    return is_fleet or "costs" in result or "present_stages_ms" in (result.get("rows") or [{}])[0]
+    """Return whether a result is of the step, of the cost of maps or of a study of drives or map fusion, which simulate what they
+    need.
+    """
+    simulates = "summaries" in result or result.get("study") in ("malicious-agents", "false-accusations")
+    return simulates or "costs" in result or "present_stages_ms" in (result.get("rows") or [{}])[0]
 
 
 def make_tables(stored: StoredResult) -> tuple[StoredTable, ...]:

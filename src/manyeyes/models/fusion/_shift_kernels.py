@@ -21,8 +21,6 @@ class ShiftSettings(NamedTuple):
     max_second: float
     prior_sigma_m: float
     prior_sigma_yaw_rad: float
-    common_sigma_m: float
-    precision_ratio: float
 
 
 @njit(cache=True, nogil=True)
@@ -136,54 +134,17 @@ def match_peaks(
 
 
 @njit(cache=True, nogil=True)
-def weigh_evidence(  # pragma: no cover
-    total: float,
-    sum_x: float,
-    sum_y: float,
-    square: float,
-    x: float,
-    y: float,
-    turn: float,
-    settings: ShiftSettings,
-) -> float:
-    """Return the logarithm of how much more probable the pairs are with a position error of the prior than without one.
-
-    An error of the heading is possible either way. The arguments are the sums of ``solve_pairs``: the normal matrix is
-    [[total, 0, -sum_y], [0, total, sum_x], [-sum_y, sum_x, square]], its right side (x, y, turn).
-    """
-    ratio = settings.precision_ratio
-    c = ratio * square + 1 / settings.prior_sigma_yaw_rad**2
-    # Without the heading: the precision of the position, and its estimate.
-    across_x, across_y = -ratio * sum_y, ratio * sum_x
-    xx, yy = ratio * total - across_x * across_x / c, ratio * total - across_y * across_y / c
-    xy = -across_x * across_y / c
-    right_x, right_y = ratio * (x - across_x * turn / c), ratio * (y - across_y * turn / c)
-    det = xx * yy - xy * xy
-    if not det > 0:
-        return 0.0
-    shift_x, shift_y = (yy * right_x - xy * right_y) / det, (xx * right_y - xy * right_x) / det
-    logs = 0.0
-    for sign, prior in ((1.0, settings.prior_sigma_m), (-1.0, 0.0)):
-        extra = settings.common_sigma_m**2 + prior * prior
-        a, b, d = yy / det + extra, -xy / det, xx / det + extra
-        area = a * d - b * b
-        length = (d * shift_x * shift_x - 2 * b * shift_x * shift_y + a * shift_y * shift_y) / area
-        logs -= sign * (length + math.log(area)) / 2
-    return logs
-
-
-@njit(cache=True, nogil=True)
 def solve_pairs(  # pragma: no cover
     arm: F64x2, measured: F64x2, precision: F64x1, settings: ShiftSettings, estimate: F64x1, covariance: F64x2
 ) -> float:
-    """Fill estimate (3,) of x, y, yaw and covariance (3, 3) by least squares with Cauchy weights and a prior; returns the evidence.
+    """Fill estimate (3,) of x, y, yaw and covariance (3, 3) by least squares with Cauchy weights and a prior; returns its chi2.
 
-    evidence: as of ``weigh_evidence``. arm: (n, 2) places from the sender, measured: (n, 2) displacements, metres; precision: (n,)
-    inverse variances.
+    chi2: the part of the evidence against no error at all that the estimate explains. arm: (n, 2) places from the sender,
+    measured: (n, 2) displacements, metres; precision: (n,) inverse variances.
     """
     prior_xy, prior_yaw = 1 / settings.prior_sigma_m**2, 1 / settings.prior_sigma_yaw_rad**2
     robust = np.ones(arm.shape[0])
-    evidence = 0.0
+    chi2 = 0.0
     for _ in range(4):
         total, sum_x, sum_y, square, x, y, turn = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(arm.shape[0]):
@@ -207,9 +168,10 @@ def solve_pairs(  # pragma: no cover
         covariance[0, 0] = 1 / a + sum_y * sum_y / (a * a) / left
         covariance[1, 1] = 1 / a + sum_x * sum_x / (a * a) / left
         covariance[0, 1] = covariance[1, 0] = -sum_x * sum_y / (a * a) / left
-        evidence = weigh_evidence(total, sum_x, sum_y, square, x, y, turn, settings)
+        chi2 = total * (estimate[0] * estimate[0] + estimate[1] * estimate[1]) + square * estimate[2] * estimate[2]
+        chi2 += 2 * estimate[2] * (sum_x * estimate[1] - sum_y * estimate[0])
         for k in range(arm.shape[0]):
             dx = measured[k, 0] - estimate[0] + estimate[2] * arm[k, 1]
             dy = measured[k, 1] - estimate[1] - estimate[2] * arm[k, 0]
             robust[k] = 1 / (1 + precision[k] * (dx * dx + dy * dy) / 4)
-    return evidence
+    return chi2

@@ -3,19 +3,12 @@
 
 Peaks of the ego's and of a sender's tokens are proposed centres of objects. Pairs of them vote for a displacement; the pairs of its
 mode give position and yaw in closed form: least squares with a Gaussian prior, so that few pairs move little. Nothing is moved
-without enough pairs, or with a second mode of almost as many votes.
-
-Whether an estimate is used is decided for all senders of an ego together. Either positions are reliable, and few senders are off,
-or they are not, as between high buildings, and most are; the pairs of all senders decide which, and with it what the pairs of one
-sender mean. So weak evidence of one sender moves nothing where the others are not off, and moves it where they are. Centres of one
-agent have a common error: it sees the near ends of the objects. Headings of proposals and vector channels are not turned; errors of
-yaw are a degree or so.
+without enough pairs, with a second mode of almost as many votes, or where chi2 is below a low limit, so that estimates near their
+own error do move tokens. Headings of proposals and vector channels are not turned; errors of yaw are a degree or so.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,12 +23,9 @@ from manyeyes.models.fusion import _shift_kernels
 from manyeyes.models.fusion._shift_kernels import ShiftSettings
 from manyeyes.models.fusion.registry import get_fusion, register_fusion
 from manyeyes.models.fusion.token_merge import DRIFT_MPS, MAX_OFFSET_CELLS
-from manyeyes.models.fusion.transform_tokens import Tokens, are_last_rows
+from manyeyes.models.fusion.transform_tokens import Tokens
 
 F64 = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-_MAX_EVIDENCE = 30.0
-"""Evidence beyond it, e^30 to one, decides alone."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +44,7 @@ class ShiftConfig:
         object_sigma_m: error of the distance of two centres of one object, beside what proposals state.
         prior_sigma_m: prior of the position error, each axis.
         prior_sigma_yaw_rad: prior of the yaw error.
-        common_sigma_m: error that all centres of an agent share, each axis.
-        precision_ratio: precision of pairs over the one that proposals state.
-        off_if_unreliable: share of senders that are off where positions are unreliable; that is as probable as not.
-        off_if_reliable: the same where they are reliable.
+        min_chi2: least squared length of the estimate in units of its own covariance.
     """
 
     min_score: float = 0.2
@@ -71,10 +58,7 @@ class ShiftConfig:
     object_sigma_m: float = 0.3
     prior_sigma_m: float = 1.0
     prior_sigma_yaw_rad: float = 0.014
-    common_sigma_m: float = 0.25
-    precision_ratio: float = 3.0
-    off_if_unreliable: float = 0.9
-    off_if_reliable: float = 0.05
+    min_chi2: float = 2.0
 
 
 DEFAULT_SHIFT = ShiftConfig()
@@ -93,8 +77,7 @@ class Peaks:
 class SenderShift:
     """Estimated correction of a sender: p becomes p + shift + yaw J (p - origin), J a quarter turn to the left.
 
-    covariance: (3, 3) of x, y, yaw after the correction. num_pairs: that it rests on. evidence: logarithm of how much more probable
-    they are if the sender is off.
+    covariance: (3, 3) of x, y, yaw after the correction. num_pairs: that it rests on.
     """
 
     shift: F64
@@ -102,7 +85,6 @@ class SenderShift:
     origin: F64
     covariance: F64
     num_pairs: int
-    evidence: float
 
     def move(self, xy: F64) -> F64:
         """Return corrected positions (n, 2)."""
@@ -117,7 +99,7 @@ class SenderShift:
 
 
 def estimate_shift(ego: Peaks, sender: Peaks, origin: F64, config: ShiftConfig = DEFAULT_SHIFT) -> SenderShift | None:
-    """Return the correction of a sender at origin (2,) in the ego's frame, used or not; None where the peaks do not give one."""
+    """Return the correction of a sender at origin (2,) in the ego's frame; None where the peaks do not give one."""
     settings = ShiftSettings(**{name: getattr(config, name) for name in ShiftSettings._fields})
     partner, mode = np.empty(len(sender.center), np.int64), np.empty(2)
     if not _shift_kernels.find_mode(ego.center, ego.weight, sender.center, sender.weight, settings, mode):
@@ -131,26 +113,10 @@ def estimate_shift(ego: Peaks, sender: Peaks, origin: F64, config: ShiftConfig =
     precision = np.sqrt(ego.weight[columns] * sender.weight[rows]) / variance
     measured, arm = ego.center[columns] - sender.center[rows], sender.center[rows] - origin
     estimate, covariance = np.empty(3), np.empty((3, 3))
-    evidence = _shift_kernels.solve_pairs(arm, measured, precision, settings, estimate, covariance)
-    if not (math.isfinite(evidence) and np.isfinite(estimate).all()):
+    chi2 = _shift_kernels.solve_pairs(arm, measured, precision, settings, estimate, covariance)
+    if not (chi2 >= config.min_chi2 and np.isfinite(estimate).all()):
         return None
-    return SenderShift(estimate[:2], float(estimate[2]), origin, covariance, num_pairs, evidence)
-
-
-def choose_moved(evidence: Sequence[float], config: ShiftConfig = DEFAULT_SHIFT) -> list[bool]:
-    """Return which senders of one ego are more probably off than not, by the evidence of each that has an estimate."""
-    ratios = [math.exp(min(value, _MAX_EVIDENCE)) for value in evidence]
-    odds = 1.0
-    for ratio in ratios:
-        odds *= _mix(config.off_if_unreliable, ratio) / _mix(config.off_if_reliable, ratio)
-    unreliable = odds / (1 + odds) if math.isfinite(odds) else 1.0
-    chances = ((unreliable, config.off_if_unreliable), (1 - unreliable, config.off_if_reliable))
-    return [sum(chance * share * ratio / _mix(share, ratio) for chance, share in chances) > 0.5 for ratio in ratios]
-
-
-def _mix(share_off: float, ratio: float) -> float:
-    """Return how much more probable pairs are than those of a sender that is not off, if a share of senders is off."""
-    return 1 - share_off + share_off * ratio
+    return SenderShift(estimate[:2], float(estimate[2]), origin, covariance, num_pairs)
 
 
 def find_peaks(xy: F64, heat: F64, sigma: F64, config: ShiftConfig = DEFAULT_SHIFT) -> Peaks:
@@ -163,24 +129,22 @@ def find_peaks(xy: F64, heat: F64, sigma: F64, config: ShiftConfig = DEFAULT_SHI
     return Peaks(xy[kept], score[kept], np.clip(sigma[kept], 0.0, 2.0))
 
 
-def align_senders(tokens: Tokens, past: Tokens | None = None, config: ShiftConfig = DEFAULT_SHIFT) -> Tokens:
+def align_senders(tokens: Tokens, config: ShiftConfig = DEFAULT_SHIFT) -> Tokens:
     """Return the tokens with those of each sender moved by its estimated correction, and the position sigma that is left.
 
-    Tokens of senders without an estimate, and the ego's own ones, stay as they are. There is no gradient to positions; that of
-    features stays. past: the ego's own earlier tokens, the last rows of tokens, if any.
+    Tokens of senders without an estimate, and the ego's own current ones, stay as they are. There is no gradient to positions;
+    that of features stays.
     """
     with torch.no_grad():
-        is_among = past is not None and len(past.sender) > 0 and are_last_rows(past, tokens)
-        num_own = int(past.sender.max()) if past is not None and is_among else 0
-        places, pose_context = _find_places(tokens, num_own, config)
+        places, pose_context = _find_places(tokens, config)
         inside = (tokens.sender == 0) | tokens.grid.contains(places)
         rows = None if bool(inside.all()) else inside.nonzero()[:, 0]
     aligned = replace(tokens, xy=places, pose_context=pose_context)
     return aligned if rows is None else aligned.select(rows)
 
 
-def _find_places(tokens: Tokens, num_own: int, config: ShiftConfig) -> tuple[Tensor, Tensor]:
-    """Return the corrected positions and pose contexts. num_own: of the last senders, which are the ego itself."""
+def _find_places(tokens: Tokens, config: ShiftConfig) -> tuple[Tensor, Tensor]:
+    """Return the corrected positions and pose contexts."""
     cell_m = tokens.grid.cell_size_m
     offset = proposed_offset(tokens.proposal)
     follows = (offset.abs().amax(1) <= MAX_OFFSET_CELLS)[:, None]
@@ -196,20 +160,15 @@ def _find_places(tokens: Tokens, num_own: int, config: ShiftConfig) -> tuple[Ten
     own = {ego: (egos == ego) & (senders == 0) for ego in range(tokens.batch_size)}
     own_peaks = {ego: find_peaks(center[m], heat[m], sigma[m], config) for ego, m in own.items()}
     moved, left = xy.copy(), context[:, 3].copy()
-    shifts: dict[int, list[tuple[Flags, SenderShift]]] = {ego: [] for ego in own}
-    is_other = (senders > 0) & (senders <= senders.max(initial=0) - num_own)
-    for number in np.unique(group[is_other]):
+    for number in np.unique(group[senders > 0]):
         mine = group == number
-        peaks, ego = find_peaks(center[mine], heat[mine], sigma[mine], config), int(egos[mine][0])
-        origin = _origin(xy[mine], sender_xy[mine], context[mine])
-        found = estimate_shift(own_peaks[ego], peaks, origin, config)
+        peaks = find_peaks(center[mine], heat[mine], sigma[mine], config)
+        found = estimate_shift(
+            own_peaks[int(egos[mine][0])], peaks, _origin(xy[mine], sender_xy[mine], context[mine]), config
+        )
         if found is not None:
-            shifts[ego].append((mine, found))
-    for estimates in shifts.values():
-        for (mine, found), is_moved in zip(estimates, choose_moved([found.evidence for _, found in estimates], config)):
-            if is_moved:
-                moved[mine] = found.move(xy[mine])
-                left[mine] = found.sigma_m(xy[mine])
+            moved[mine] = found.move(xy[mine])
+            left[mine] = found.sigma_m(xy[mine])
     pose_context = tokens.pose_context.clone()
     pose_context[:, 3] = torch.from_numpy(left).to(pose_context)
     changed = torch.from_numpy((moved != xy).any(1)).to(tokens.xy.device)
@@ -227,7 +186,7 @@ def _origin(xy: F64, sender_xy: F64, context: F64) -> F64:
 
 def _build_aligned_fast(channels: int, attention: AttentionConfig) -> nn.Module:
     module = get_fusion("fast")(channels, attention)
-    module.register_forward_pre_hook(lambda _, given: (align_senders(*given[:2]), *given[1:]))
+    module.register_forward_pre_hook(lambda _, given: (align_senders(given[0]), *given[1:]))
     return module
 
 
