@@ -272,7 +272,7 @@ class RayEvidenceDetector(MisbehaviourDetector):
             is_refuted, tracks = one.kinds == _REFUTED, _memory(now, one.claims.agent_id).tracks
             if not is_refuted.any() and not tracks.refuted_ns.any():
                 continue
-            # A weak claim counts against nobody, so that nobody's claim beside it needs protection.
+            # A weak claim changes no trust, so its place needs no dispute.
             is_likely = one.claims.score >= self.evidence.min_corroborating_score
             is_supported, disputed = one.kinds == _SUPPORTED, is_refuted & one.corroborated & is_likely
             if len(tracks):
