@@ -69,6 +69,7 @@ class Street:
     state: object | None = None
     index: int = 0
     stated: Mapping[int, np.ndarray] = field(default_factory=dict)
+    is_infrastructure: bool = False
 
     def step(
         self,
@@ -83,6 +84,7 @@ class Street:
         points = self.spoil(scan(self.solid), self.index)
         pose = Transform.identity()
         frame = AgentFrame.of(PointCloud.of(points), pose, 0, now_ns, sensor_height_m=HEIGHT_M)
+        frame = replace(frame, is_infrastructure=self.is_infrastructure)
         stated = tuple(
             replace(
                 Claims.of(agent_id, boxes, np.full(len(boxes), sigma_m)),

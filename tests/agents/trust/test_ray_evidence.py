@@ -106,6 +106,19 @@ def test_low_scores_are_refuted_but_accuse_no_sender(street, score):
     assert sender(found, 1).status is NORMAL and sender(found, 1).trust == pytest.approx(PRIOR)
 
 
+@pytest.mark.parametrize("offset", [(0.3, 0.2), (0.2, -2.2), (-1.7, 2.3), (2.3, -2.1)])
+def test_the_ego_itself_as_others_see_it_at_a_wrong_pose_accuses_no_sender(street, offset):
+    """Its own vehicle is among what others report; displaced, it lies where the rays of the ego pass."""
+    found = street.run(20, {1: cars(SEEN, SEEN_TOO, offset)}, sigma_m=0.6)
+    assert kinds(found, 1)[2] in (Evidence.REFUTED, Evidence.UNCHECKED)
+    assert sender(found, 1).status is NORMAL and sender(found, 1).trust > 0.8
+
+
+def test_a_false_car_beside_a_roadside_unit_is_not_the_ego(street):
+    street.is_infrastructure = True
+    assert sender(street.run(5, {1: cars(SEEN, SEEN_TOO, (0.2, -2.2))}, sigma_m=0.6), 1).status is MALICIOUS
+
+
 def test_one_attacker_among_three_is_named_and_the_others_are_not(street):
     claims = {1: cars(SEEN, SEEN_TOO, HIDDEN), 2: cars(SEEN, SEEN_TOO, FREE), 3: HONEST}
     found = street.run(5, claims)

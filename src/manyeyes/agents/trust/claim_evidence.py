@@ -60,21 +60,21 @@ class CheckedClaims:
     """Claims of one sender (N), with evidence: kinds (N,) of Evidence.
 
     is_detected: (N,) bool, the ego detects it. corroborated: (N,) bool, a trusted third agent claims it too, whatever the ego's
-    evidence is. is_minority: (N,) bool, refuted by
-    observers that are not the majority of senders: the claim is removed, and no trust changes.
+    evidence is. is_uncounted: (N,) bool, refuted, hence removed, but no trust changes: only a minority of senders refutes it, or it
+    may be the ego itself, displaced by an error of pose.
     """
 
     claims: Claims
     kinds: Kinds
     is_detected: NDArray[np.bool_]
     corroborated: NDArray[np.bool_]
-    is_minority: NDArray[np.bool_]
+    is_uncounted: NDArray[np.bool_]
 
     def refute(self, is_denied: NDArray[np.bool_], is_minority: NDArray[np.bool_]) -> CheckedClaims:
         """Return the claims where the denied ones (N,) that the ego itself cannot check are refuted."""
         is_denied = is_denied & ((self.kinds == _UNCHECKED) | (self.kinds == _CORROBORATED))
         kinds = np.where(is_denied, np.uint8(_REFUTED), self.kinds)
-        return replace(self, kinds=kinds, is_minority=is_denied & is_minority)
+        return replace(self, kinds=kinds, is_uncounted=self.is_uncounted | (is_denied & is_minority))
 
 
 def check_claims(
@@ -101,11 +101,21 @@ def check_claims(
     kinds = is_own * np.uint8(_SUPPORTED)
     rays = _check_rays(frame, columns, sigma_m, kinds, config, probes)
     kinds[is_third & (kinds == _UNCHECKED)] = _CORROBORATED
+    # The ego does not detect itself, and its rays pass through every other place around it.
+    is_ego = (kinds == _REFUTED) & _is_near_ego(frame, xy, gates)
     checked = (
-        CheckedClaims(one, kinds[a:b], is_own[a:b], is_third[a:b], np.zeros(b - a, np.bool_))
+        CheckedClaims(one, kinds[a:b], is_own[a:b], is_third[a:b], is_ego[a:b])
         for one, a, b in zip(claims, sizes, sizes[1:])
     )
     return tuple(checked), rays
+
+
+def _is_near_ego(frame: AgentFrame, xy: Floats, gate_m: Floats) -> NDArray[np.bool_]:
+    """Return (N,) which of the positions (N, 2) are within a gate (N,) of the ego's own vehicle; roadside units have none."""
+    if frame.is_infrastructure:
+        return np.zeros(len(xy), np.bool_)
+    x, y = (0.0, 0.0) if frame.body is None else frame.body.center[:2]
+    return np.hypot(xy[:, 0] - x, xy[:, 1] - y) < gate_m
 
 
 def classify_rays(rays: I64x2, config: ClaimCheckConfig) -> Kinds:

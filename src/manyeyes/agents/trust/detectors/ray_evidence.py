@@ -121,7 +121,7 @@ class RayEvidenceDetector(MisbehaviourDetector):
         if len(now.disputes.xy):
             checks = [_mark_disputed(check, now.disputes.cover(check.xy)) for check in checks]
         counted = [
-            _drop_minority(check, one.is_minority) if one.is_minority.any() else check
+            _drop_uncounted(check, one.is_uncounted) if one.is_uncounted.any() else check
             for one, check in zip(checked, checks)
         ]
         num_claims = sum(len(check.xy) for check in checks)
@@ -230,7 +230,7 @@ class RayEvidenceDetector(MisbehaviourDetector):
 
     def _is_accused(self, one: CheckedClaims, now: TrustState) -> bool:
         """Return whether a claim of a sender is refuted now, or was in one of its last checks."""
-        is_refuted = (one.kinds == _REFUTED) & (one.claims.score >= self.naming.min_score)
+        is_refuted = (one.kinds == _REFUTED) & ~one.is_uncounted & (one.claims.score >= self.naming.min_score)
         tracks = _memory(now, one.claims.agent_id).tracks
         return bool(is_refuted.any() or count_refuted_checks(tracks, self.naming.min_score).any())
 
@@ -385,7 +385,7 @@ def _mark_disputed(checks: ClaimChecks, is_disputed: NDArray[np.bool_]) -> Claim
     return replace(checks, evidence=np.where(is_disputed, np.uint8(_DISPUTED), checks.evidence))
 
 
-def _drop_minority(checks: ClaimChecks, is_minority: NDArray[np.bool_]) -> ClaimChecks:
-    """Return checks in which claims that a minority refutes are unchecked, as trust and naming count them."""
-    is_dropped = is_minority & (checks.evidence == _REFUTED)
+def _drop_uncounted(checks: ClaimChecks, is_uncounted: NDArray[np.bool_]) -> ClaimChecks:
+    """Return checks in which claims that count against no sender are unchecked, as trust and naming count them."""
+    is_dropped = is_uncounted & (checks.evidence == _REFUTED)
     return replace(checks, evidence=np.where(is_dropped, np.uint8(_UNCHECKED), checks.evidence))
