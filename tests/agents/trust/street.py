@@ -59,7 +59,7 @@ def scan(solid: Boxes) -> torch.Tensor:
 @dataclass
 class Street:
     """The ego's view over time. solid: what is there; own: what the ego detects. spoil: changes the returns of a frame. stated:
-    positions that senders state in their own frames, by id.
+    positions that senders state in their own frames, by id. sender_places: of senders, by id; others are 5 m apart.
     """
 
     detector: MisbehaviourDetector
@@ -70,6 +70,7 @@ class Street:
     index: int = 0
     stated: Mapping[int, np.ndarray] = field(default_factory=dict)
     is_infrastructure: bool = False
+    sender_places: Mapping[int, tuple[float, float]] = field(default_factory=dict)
 
     def step(
         self,
@@ -88,11 +89,11 @@ class Street:
         stated = tuple(
             replace(
                 Claims.of(agent_id, boxes, np.full(len(boxes), sigma_m)),
-                sender_xy=sender_xy,
+                sender_xy=self.sender_places.get(agent_id, (sender_xy[0], sender_xy[1] - 5.0 * number)),
                 is_complete=is_complete,
                 stated_xy=self.stated.get(agent_id),
             )
-            for agent_id, boxes in sorted(claims.items())
+            for number, (agent_id, boxes) in enumerate(sorted(claims.items()))
         )
         messages = tuple(Message(one.agent_id, now_ns, pose, torch.zeros(3, 3).double()) for one in stated)
         content = MisbehaviourInput(

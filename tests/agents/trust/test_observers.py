@@ -226,7 +226,7 @@ def is_refuted_beyond(gap_m: float, sigma_m: float, config: ObserverConfig) -> b
     frame = AgentFrame.of(PointCloud.of(torch.zeros(0, 3)), Transform.identity(), 0, 0)
     messages = (replace(place, agent_id=1, sight=None), place)
     nothing = PlacedBoxes(np.zeros((0, 7)), np.zeros((0, 2)), np.zeros(0))
-    counts = count_observers(frame, messages, claims, nothing, {2}, 0.02, 0.6, replace(config, min_observers=1))
+    counts = count_observers(frame, messages, claims, nothing, {2}, (0.02, 0.6, 2.0), replace(config, min_observers=1))
     return bool(counts[0][0])
 
 

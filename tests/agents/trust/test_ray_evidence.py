@@ -12,6 +12,7 @@ from tests.agents.trust.street import (
     FREE,
     FREE_TOO,
     HIDDEN,
+    OTHER_AGENT,
     SEEN,
     SEEN_TOO,
     Street,
@@ -186,6 +187,44 @@ def test_a_colluding_pair_with_trust_disputes_a_place_and_its_claim_is_marked(st
     found = street.run(10, claims)
     assert kinds(found, 1)[2] == Evidence.DISPUTED
     assert all(s.status is NORMAL for s in found.senders)
+
+
+ONE_OF_A_PAIR = cars(SEEN, SEEN_TOO, FREE, FREE_TOO)
+OTHER_OF_A_PAIR = cars(SEEN, (12.1, 12.1), (12.3, -6.2), (18.2, -8.1))
+
+
+@pytest.mark.parametrize("num_others", [0, 1, 2])
+def test_a_pair_that_supports_each_other_at_two_places_is_named_where_it_is_a_minority(street, num_others):
+    others = {agent_id: cars((15.2, 0.1), (12.2, 12.2 + agent_id / 30)) for agent_id in range(3, 3 + num_others)}
+    honest = {1: HONEST, 2: cars((15.1, 0.0), (12.0, 12.1)), **others}
+    street.run(5, honest)
+    found = street.run(10, {**honest, 1: ONE_OF_A_PAIR, 2: OTHER_OF_A_PAIR})
+    named = [one.agent_id for one in found.senders if one.status is MALICIOUS]
+    assert named == ([1, 2] if num_others == 2 else [])
+    if named:
+        assert "few other senders claim them" in sender(found, 1).reason and sender(found, 1).keeps_confirmed
+
+
+def test_a_pair_is_named_after_three_messages_and_only_for_confident_claims(street):
+    honest = {agent_id: cars((15.0 + agent_id / 20, 0.0), (12.0, 12.0 + agent_id / 30)) for agent_id in range(1, 5)}
+    weak = Street(DETECTOR)
+    for one in (street, weak):
+        one.run(5, honest)
+    pair = {**honest, 1: ONE_OF_A_PAIR, 2: OTHER_OF_A_PAIR}
+    assert sender(street.run(2, pair), 1).status is NORMAL and sender(street.step(pair), 1).status is MALICIOUS
+    low = {a: replace(pair[a], score=torch.full((4,), 0.75).double()) for a in (1, 2)}
+    assert sender(weak.run(10, {**honest, **low}), 1).status is NORMAL
+
+
+def test_identities_at_one_place_do_not_corroborate_each_other(street):
+    """One attacker under several identities, whose boxes differ by centimetres, after honest messages of all of them."""
+    places = {agent_id: (OTHER_AGENT[0], OTHER_AGENT[1] + 0.1 * agent_id) for agent_id in (1, 2, 3)}
+    street.sender_places = places
+    honest = {agent_id: cars((15.0 + agent_id / 20, 0.0), (12.0, 12.0 + agent_id / 20)) for agent_id in places}
+    street.run(5, honest)
+    lies = {a: Boxes.cat([honest[a], cars((12.0, -6.0 - a / 20))]) for a in places}
+    assert all(one.status is MALICIOUS for one in street.run(5, lies).senders)
+    assert kinds(street.step({**lies, 1: Boxes.cat([honest[1], cars(HIDDEN)])}), 1)[2] == Evidence.UNCHECKED
 
 
 def test_a_third_agent_of_high_trust_corroborates_what_the_ego_cannot_see(street):

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from manyeyes._jit import Boolx1, Boolx2, F64x1, F64x2, I64x1, U8x1, njit
@@ -56,14 +58,16 @@ def match_claims(
     first: I64x1,
     own: F64x2,
     is_trusted: Boolx1,
-    copy_m: float,
-    max_copied: float,
+    senders: F64x2,
+    limits: tuple[float, float, float],
 ) -> tuple[Boolx1, Boolx1]:  # pragma: no cover
     """Return (N,) which claims match one of the ego's detections (K, 2), and which match a likely claim of a trusted third agent.
 
-    xy (N, 2), gate_m (N,), is_likely (N,): claims of all senders, one after the other; first: (S + 1,) of each sender. A third
-    agent that states more than max_copied of the claims within copy_m is no other source.
+    xy (N, 2), gate_m (N,), is_likely (N,): claims of all senders, one after the other; first: (S + 1,) of each sender, which are at
+    senders (S, 2). limits: copy_m, max_copied, min_apart_m. A third agent that states more than max_copied of the claims within
+    copy_m, or is nearer than min_apart_m, is no other source.
     """
+    copy_m, max_copied, min_apart_m = limits
     is_own, is_corroborated = np.zeros(len(xy), np.bool_), np.zeros(len(xy), np.bool_)
     for n in range(len(first) - 1):
         begin, end = first[n], first[n + 1]
@@ -75,6 +79,8 @@ def match_claims(
         for k in range(len(first) - 1):
             third = xy[first[k] : first[k + 1]]
             if k == n or not is_trusted[k] or not len(third):
+                continue
+            if math.hypot(senders[n, 0] - senders[k, 0], senders[n, 1] - senders[k, 1]) < min_apart_m:
                 continue
             fewest = min(end - begin, len(third))
             equal = find_partners(xy[begin:end], third, np.full(end - begin, copy_m)) >= 0

@@ -37,7 +37,8 @@ class ClaimCheckConfig:
     hits, or if no hit is an inner one: those are of a wall or another object beside the box.
     min_hits: returns that support. min_corroborating_trust, min_corroborating_score: of a third agent, and of its claim; weaker
     claims are often errors, beside which a false claim would seem to be true. max_copied: fraction of equal boxes of two
-    senders, within copy_m, above which they are one source.
+    senders, within copy_m, above which they are one source; min_apart_m: of two senders, below which they are one: identities
+    of one attacker, as two vehicles cannot be at one place.
     """
 
     min_own_score: float = 0.3
@@ -53,6 +54,12 @@ class ClaimCheckConfig:
     min_corroborating_score: float = 0.5
     max_copied: float = 0.6
     copy_m: float = 0.02
+    min_apart_m: float = 2.0
+
+    @property
+    def sources(self) -> tuple[float, float, float]:
+        """What tells senders that are one source: copy_m, max_copied, min_apart_m."""
+        return self.copy_m, self.max_copied, self.min_apart_m
 
 
 @dataclass(frozen=True)
@@ -97,7 +104,8 @@ def check_claims(
     is_trusted = np.array([trust.get(one.agent_id, 0.0) >= config.min_corroborating_trust for one in claims], np.bool_)
     is_likely = np.concatenate([np.zeros(0), *(one.score for one in claims)]) >= config.min_corroborating_score
     gates, places = config.gate_m + 2 * sigma_m, np.ascontiguousarray(own)
-    is_own, is_third = match_claims(xy, gates, is_likely, sizes, places, is_trusted, config.copy_m, config.max_copied)
+    senders = np.array([one.sender_xy for one in claims], np.float64).reshape(-1, 2)
+    is_own, is_third = match_claims(xy, gates, is_likely, sizes, places, is_trusted, senders, config.sources)
     kinds = is_own * np.uint8(_SUPPORTED)
     rays = _check_rays(frame, columns, sigma_m, kinds, config, probes)
     kinds[is_third & (kinds == _UNCHECKED)] = _CORROBORATED

@@ -30,7 +30,7 @@ class ObserverConfig:
     min_observers: trusted, independent, and neither the claimer nor accused. margin_m, num_sigmas: the footprint of the claim is
     enlarged by margin_m and so many standard deviations of claim and observer together, of min_sigma_m or more, to max_margin_m;
     beyond it nothing is concluded.
-    max_height_m: of the ground of the claim above or below that of the observer. min_apart_m: of observers that count as two.
+    max_height_m: of the ground of the claim above or below that of the observer.
     min_own_score: of a detection of the ego; a sight that states it to be free is not used.
     """
 
@@ -40,7 +40,6 @@ class ObserverConfig:
     min_sigma_m: float = 0.3
     max_margin_m: float = 2.5
     max_height_m: float = 0.5
-    min_apart_m: float = 2.0
     min_own_score: float = 0.5
 
 
@@ -59,8 +58,7 @@ def count_observers(
     claims: Sequence[Claims],
     own: PlacedBoxes,
     trusted: Set[int],
-    copy_m: float,
-    max_copied: float,
+    sources: tuple[float, float, float],
     config: ObserverConfig,
 ) -> list[Rows]:
     """Return (N,) for the claims of each sender, how many independent observers state that their places are free.
@@ -68,13 +66,14 @@ def count_observers(
     Args:
         messages: of the senders of the claims, in their order. own: the ego's detections of min_own_score. trusted: senders whose
             sights are used.
-        copy_m, max_copied: senders with a larger fraction of claims within copy_m are one source.
+        sources: copy_m, max_copied and min_apart_m. Senders with a fraction of claims above max_copied within copy_m of each other,
+            or nearer to each other than min_apart_m, are one source.
     """
     sights = [row for row, message in enumerate(messages) if message.sight is not None and message.agent_id in trusted]
     sights = [row for row in sights if not _states_free(frame, messages[row], own, config).any()]
     if len(sights) < config.min_observers:
         return [np.zeros(len(one), np.int64) for one in claims]
-    source = _find_sources(claims, copy_m, max_copied, config.min_apart_m)
+    source = _find_sources(claims, *sources)
     counts = list[Rows]()
     for row, one in enumerate(claims):
         placed = PlacedBoxes(one.columns, one.velocity, one.sigma_m)

@@ -30,8 +30,9 @@ class SenderMemory:
     """One sender: its trust at updated_ns; the capture time of its last message; tracks of its claims; objects that it omits.
 
     reason: of its exclusion; empty if it is not excluded. keeps_confirmed: it was excluded for refuted claims; those that others
-    confirm are still fused. contents: of its last messages; copies: which of them were copies, the newest first. contradicted_ns:
-    when its stated pose was last contradicted.
+    confirm are still fused. contents: of its last messages; copies: which of them were copies, the newest first; contested: in
+    which of them a few senders alone claimed several objects that the ego refutes. contradicted_ns: when its stated pose was
+    last contradicted.
     """
 
     trust: BetaTrust
@@ -43,6 +44,7 @@ class SenderMemory:
     keeps_confirmed: bool = False
     contents: tuple[StatedContent, ...] = ()
     copies: tuple[bool, ...] = ()
+    contested: tuple[bool, ...] = ()
     contradicted_ns: int = NEVER_NS
 
 

@@ -8,7 +8,7 @@ checked change no trust.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -45,7 +45,8 @@ from manyeyes.agents.trust.sender_state import (
 from manyeyes.datatypes import Boxes, Message
 
 LOW_TRUST = "low trust"
-NUM_COPY_CHECKS = 5
+NUM_MESSAGES = 5
+"""Number of last messages of a sender that are counted as copies, or as contested."""
 # Members of an enumeration are slow to read.
 _SUPPORTED, _CORROBORATED = int(Evidence.SUPPORTED), int(Evidence.CORROBORATED)
 _DISPUTED, _REFUTED = int(Evidence.DISPUTED), int(Evidence.REFUTED)
@@ -72,13 +73,17 @@ class NamingConfig:
     min_score: of a claim that counts against its sender: honest detectors err for seconds with scores up to 0.75, and a refuted
     claim is removed whatever its score. min_refuted: of the last five checks of one claim. min_refuted_each: of
     the checks of each of two claims. many_claims: above so many claims of all senders in one frame, min_refuted is one more,
-    since more chances of an error make more errors. sign_change_ns: a place where the evidence turns within it is disputed.
+    since more chances of an error make more errors. min_contested: of refuted claims of one sender that trusted senders claim too,
+    whose places are hence disputed. In min_refuted of its last messages they name it, if the senders of such claims are fewer than
+    the other agents, the ego among these: two that support each other. sign_change_ns: a place where the evidence turns within it
+    is disputed.
     """
 
     min_score: float = 0.8
     min_refuted: int = 3
     min_refuted_each: int = 2
     many_claims: int = 200
+    min_contested: int = 2
     sign_change_ns: int = 1_000_000_000
 
 
@@ -116,6 +121,7 @@ class RayEvidenceDetector(MisbehaviourDetector):
         now, found = self._compare_messages(received, own, now)
         checked, omits = self._check(received, own, now, unclaimed, found)
         checked = self._check_observers(received, detections, checked, now, found)
+        contested = self._find_contested(checked, found)
         checks = [self._follow(one, now) for one in checked]
         now = replace(now, disputes=now.disputes.add(self._find_disputes(checked, checks, now), now.now_ns))
         if len(now.disputes.xy):
@@ -130,7 +136,8 @@ class RayEvidenceDetector(MisbehaviourDetector):
             agent_id = message.agent_id
             is_faulty = agent_id in received.faulty or agent_id in found.contradicted
             fault = self.trust.omitted * is_omitting
-            memory = self._update_sender(now, message, check, fault, is_faulty or agent_id in found.copied, omitted)
+            is_unused = is_faulty or agent_id in found.copied
+            memory = self._update_sender(now, message, check, fault, is_unused, omitted, agent_id in contested)
             memory, exclusions = self._decide(agent_id, memory, exclusions, now, num_claims, is_faulty)
             senders[agent_id] = memory
             is_excluded = exclusions.contains(agent_id, now.now_ns)
@@ -168,7 +175,7 @@ class RayEvidenceDetector(MisbehaviourDetector):
                 contradicted.add(one.agent_id)
             copies, contents = memory.copies, add_contents(memory.contents, one, time_ns)
             if not is_known(memory.contents, time_ns):
-                copies = (one.agent_id in copied, *copies)[:NUM_COPY_CHECKS]
+                copies = (one.agent_id in copied, *copies)[:NUM_MESSAGES]
             trust = now.trust_of(one.agent_id, self.trust)
             senders[one.agent_id] = replace(
                 memory,
@@ -218,15 +225,31 @@ class RayEvidenceDetector(MisbehaviourDetector):
             and not self._is_accused(one, now)
         }
         own = detections.boxes(self.observers.min_own_score)
-        copies = self.evidence.copy_m, self.evidence.max_copied
+        sources = self.evidence.sources
         counts = count_observers(
-            received.frame, received.messages, received.claims, own, trusted, *copies, self.observers
+            received.frame, received.messages, received.claims, own, trusted, sources, self.observers
         )
         num_senders = len(set(received.agent_ids) - unused)
         return tuple(
             one.refute(count >= self.observers.min_observers, 2 * count <= num_senders)
             for one, count in zip(checked, counts)
         )
+
+    def _find_contested(self, checked: Sequence[CheckedClaims], found: _Findings) -> Set[int]:
+        """Return the senders of several refuted claims that trusted senders claim too, if these senders are a minority."""
+        senders = {
+            one.claims.agent_id
+            for one in checked
+            if np.count_nonzero(
+                (one.kinds == _REFUTED)
+                & one.corroborated
+                & ~one.is_uncounted
+                & (one.claims.score >= self.naming.min_score)
+            )
+            >= self.naming.min_contested
+        }
+        num_agents = 1 + sum(one.claims.agent_id not in found.unused for one in checked)
+        return senders if 2 * len(senders) < num_agents else frozenset()
 
     def _is_accused(self, one: CheckedClaims, now: TrustState) -> bool:
         """Return whether a claim of a sender is refuted now, or was in one of its last checks."""
@@ -250,7 +273,7 @@ class RayEvidenceDetector(MisbehaviourDetector):
             return memory, exclusions
         if named or (is_low and not memory.reason):
             is_copier = sum(memory.copies) >= self.copies.min_copies
-            is_refuted = bool(count_refuted_checks(memory.tracks, self.naming.min_score).any())
+            is_refuted = bool(count_refuted_checks(memory.tracks, self.naming.min_score).any() or any(memory.contested))
             memory = replace(memory, reason=named or LOW_TRUST, keeps_confirmed=is_refuted and not is_copier)
             return memory, exclusions.add(agent_id, now.now_ns)
         if memory.reason:
@@ -294,6 +317,7 @@ class RayEvidenceDetector(MisbehaviourDetector):
         fault: float,
         is_faulty: bool,
         omitted: OwnObjects,
+        is_contested: bool,
     ) -> SenderMemory:
         """Return the memory of a sender after its claims of this frame; a message that was assessed before adds nothing.
 
@@ -311,7 +335,13 @@ class RayEvidenceDetector(MisbehaviourDetector):
         tracks = update_tracks(memory.tracks, checks, now.now_ns)
         captured_ns = message.timestamp_ns
         return replace(
-            memory, trust=trust, updated_ns=now.now_ns, captured_ns=captured_ns, tracks=tracks, omitted=omitted
+            memory,
+            trust=trust,
+            updated_ns=now.now_ns,
+            captured_ns=captured_ns,
+            tracks=tracks,
+            omitted=omitted,
+            contested=(is_contested, *memory.contested)[:NUM_MESSAGES],
         )
 
     def _find_reason(self, memory: SenderMemory, num_claims: int) -> str:
@@ -319,6 +349,8 @@ class RayEvidenceDetector(MisbehaviourDetector):
         tracks = memory.tracks
         if sum(memory.copies) >= self.copies.min_copies:
             return f"{sum(memory.copies)} of its last messages were copies of others' content"
+        if sum(memory.contested) >= self.naming.min_refuted:
+            return f"several claims were refuted in {sum(memory.contested)} of its last messages, and few other senders claim them"
         refuted = count_refuted_checks(tracks, self.naming.min_score)
         needed = self.naming.min_refuted + (num_claims > self.naming.many_claims)
         max_refuted = int(refuted.max(initial=0))
