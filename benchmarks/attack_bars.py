@@ -89,6 +89,10 @@ def measure_attacks(rows: list[dict[str, Any]]) -> Iterator[Measured]:
         for proportion, minimum, text in zip(row["named_checkable"], (MIN_NAMED_5, MIN_NAMED_10), ("5", "10")):
             if proportion["total"]:
                 yield _proportion("2", f"{name}: checkable, named within {text} frames", proportion, minimum)
+        for proportion, minimum, text in zip(row["named_by_ego"], (MIN_NAMED_5, MIN_NAMED_10), ("5", "10")):
+            if proportion["total"] and proportion["total"] < row["named_checkable"][0]["total"]:
+                name_of = f"{name}: of these, checkable by the ego itself, named within {text} frames"
+                yield _proportion("2", name_of, proportion, minimum)
         if row["attack"] in PERSISTENT_SEEN and row["named"][0]["total"]:
             yield _proportion("2", f"{name}: on seen road, named within 5 frames", row["named"][0], MIN_NAMED_SEEN)
         if row["attack"] in COLLUDING and row["named"][1]["total"]:

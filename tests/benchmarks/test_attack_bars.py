@@ -18,7 +18,7 @@ def row(attack: str, defence: str = "ray-evidence", **changes: object) -> dict:
     base = {
         "attack": attack, "method": "late", "num_malicious": 1, "defence": defence, "num_scenarios": 20,
         "vs_clean": interval(-0.001, -0.002, 0.0), "vs_oracle": interval(-0.004, -0.008, 0.0), "vs_alone": interval(0.1, 0.05, 0.2),
-        "named": [none, none], "named_checkable": [none, none], "seen": survival, "blind": survival,
+        "named": [none, none], "named_checkable": [none, none], "named_by_ego": [none, none], "seen": survival, "blind": survival,
     }  # fmt: skip
     return {**base, **changes}
 

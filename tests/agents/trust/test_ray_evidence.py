@@ -216,9 +216,9 @@ def test_a_pair_is_named_after_three_messages_and_only_for_confident_claims(stre
     assert sender(weak.run(10, {**honest, **low}), 1).status is NORMAL
 
 
-def test_identities_at_one_place_do_not_corroborate_each_other(street):
+def test_identities_at_one_place_or_in_a_chain_do_not_corroborate_each_other(street):
     """One attacker under several identities, whose boxes differ by centimetres, after honest messages of all of them."""
-    places = {agent_id: (OTHER_AGENT[0], OTHER_AGENT[1] + 0.1 * agent_id) for agent_id in (1, 2, 3)}
+    places = {agent_id: (OTHER_AGENT[0], OTHER_AGENT[1] + 1.5 * agent_id) for agent_id in (1, 2, 3)}
     street.sender_places = places
     honest = {agent_id: cars((15.0 + agent_id / 20, 0.0), (12.0, 12.0 + agent_id / 20)) for agent_id in places}
     street.run(5, honest)

@@ -28,12 +28,17 @@ def sender(number: int, malicious: bool, named: list[int], trust: list[float] | 
 
 
 def claim(
-    rays: list[int], score: list[float], near_real: bool = False, evidence: Evidence = Evidence.UNCHECKED
+    rays: list[int],
+    score: list[float],
+    near_real: bool = False,
+    evidence: Evidence = Evidence.UNCHECKED,
+    ego_rays: list[int] | None = None,
 ) -> ClaimRecord:
     n = len(rays)
     return ClaimRecord(
-        0, 2, 0, near_real, torch.ones(n, dtype=torch.bool), torch.tensor(rays), torch.tensor(score).double(),
-        torch.full((n,), int(evidence)), torch.full((n,), 0.9).double(),
+        0, 2, 0, near_real, torch.ones(n, dtype=torch.bool), torch.tensor(rays),
+        torch.tensor(ego_rays or rays), torch.tensor(score).double(), torch.full((n,), int(evidence)),
+        torch.full((n,), 0.9).double(),
     )  # fmt: skip
 
 
@@ -70,6 +75,15 @@ def test_only_senders_with_a_checkable_claim_are_selected() -> None:
     with_claim = drive((sender(2, True, [0, 1, 1]),), (claim([12, 12, 12], [0.9, 0.9, 0.9]),))
     near_real = drive((sender(2, True, [0, 1, 1]),), (claim([12, 12, 12], [0.9, 0.9, 0.9], near_real=True),))
     assert times_to_detection([with_claim, near_real, drive((sender(2, True, [0, 1, 1]),))], checkable=True) == (2,)
+
+
+def test_a_claim_that_only_others_see_through_is_not_checkable_by_the_ego() -> None:
+    drives = [
+        drive((sender(2, True, [0, 1, 1]),), (claim([12, 12, 12], [0.9] * 3, ego_rays=[12, 0, 0]),)),
+        drive((sender(2, True, [0, 0, 1]),), (claim([12, 12, 12], [0.9] * 3),)),
+    ]
+    assert times_to_detection(drives, checkable=True) == (2, 3)
+    assert times_to_detection(drives, checkable=True, by_ego=True) == (3,)
 
 
 def test_survival_splits_checkable_from_blind_claims() -> None:

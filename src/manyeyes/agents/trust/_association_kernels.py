@@ -51,6 +51,20 @@ def nearest_rows(one: F64x2, other: F64x2, radius_m: float) -> I64x1:  # pragma:
 
 
 @njit(cache=True, nogil=True)
+def find_places(senders: F64x2, min_apart_m: float) -> I64x1:  # pragma: no cover
+    """Return (S,) the number of the place of each sender (S, 2): of a chain of senders nearer than min_apart_m it is one."""
+    place = np.arange(len(senders))
+    for i in range(len(senders)):
+        for j in range(i):
+            if math.hypot(senders[i, 0] - senders[j, 0], senders[i, 1] - senders[j, 1]) < min_apart_m:
+                merged, kept = place[i], place[j]
+                for k in range(i + 1):
+                    if place[k] == merged:
+                        place[k] = kept
+    return place
+
+
+@njit(cache=True, nogil=True)
 def match_claims(
     xy: F64x2,
     gate_m: F64x1,
@@ -65,9 +79,10 @@ def match_claims(
 
     xy (N, 2), gate_m (N,), is_likely (N,): claims of all senders, one after the other; first: (S + 1,) of each sender, which are at
     senders (S, 2). limits: copy_m, max_copied, min_apart_m. A third agent that states more than max_copied of the claims within
-    copy_m, or is nearer than min_apart_m, is no other source.
+    copy_m, or is at the same place, is no other source.
     """
     copy_m, max_copied, min_apart_m = limits
+    place = find_places(senders, min_apart_m)
     is_own, is_corroborated = np.zeros(len(xy), np.bool_), np.zeros(len(xy), np.bool_)
     for n in range(len(first) - 1):
         begin, end = first[n], first[n + 1]
@@ -78,9 +93,7 @@ def match_claims(
             is_own[begin + row] = partner[row] >= 0
         for k in range(len(first) - 1):
             third = xy[first[k] : first[k + 1]]
-            if k == n or not is_trusted[k] or not len(third):
-                continue
-            if math.hypot(senders[n, 0] - senders[k, 0], senders[n, 1] - senders[k, 1]) < min_apart_m:
+            if k == n or place[k] == place[n] or not is_trusted[k] or not len(third):
                 continue
             fewest = min(end - begin, len(third))
             equal = find_partners(xy[begin:end], third, np.full(end - begin, copy_m)) >= 0

@@ -78,14 +78,19 @@ def first_named(sender: SenderRecord) -> int | None:
     return int(named[0]) + 1 if len(named) else None
 
 
-def times_to_detection(drives: Sequence[DriveRecord], checkable: bool = False) -> tuple[int | None, ...]:
-    """Return the time to detection of each malicious sender that was received; checkable: of those with a checkable claim."""
+def times_to_detection(
+    drives: Sequence[DriveRecord], checkable: bool = False, by_ego: bool = False
+) -> tuple[int | None, ...]:
+    """Return the time to detection of each malicious sender that was received.
+
+    checkable: of those with a checkable claim; by_ego: that the ego itself can check.
+    """
     return tuple(
         first_named(sender)
         for drive in drives
         for sender in drive.senders
         if sender.is_malicious and bool(sender.is_received.any())
-        if not checkable or has_checkable_claim(drive, sender)
+        if not checkable or has_checkable_claim(drive, sender, by_ego)
     )
 
 
@@ -94,16 +99,18 @@ def detection_rate(times: Sequence[int | None], num_frames: int) -> Proportion:
     return Proportion.of(sum(at is not None and at <= num_frames for at in times), len(times))
 
 
-def has_checkable_claim(drive: DriveRecord, sender: SenderRecord) -> bool:
-    """Return whether one of a sender's false claims can be checked by an honest agent."""
+def has_checkable_claim(drive: DriveRecord, sender: SenderRecord, by_ego: bool = False) -> bool:
+    """Return whether one of a sender's false claims can be checked by an honest agent; by_ego: by the ego itself."""
     return any(
-        is_claim_checkable(claim) for claim in drive.claims if (claim.ego, claim.sender) == (sender.ego, sender.sender)
+        is_claim_checkable(claim, by_ego)
+        for claim in drive.claims
+        if (claim.ego, claim.sender) == (sender.ego, sender.sender)
     )
 
 
-def is_claim_checkable(claim: ClaimRecord) -> bool:
-    """Return whether enough rays cross a claim while it is sent, and nothing real is near."""
-    rays = np.where(claim.is_sent.numpy(), claim.num_rays.numpy(), 0)
+def is_claim_checkable(claim: ClaimRecord, by_ego: bool = False) -> bool:
+    """Return whether enough rays, of any honest agent or of the ego, cross a claim while it is sent, and nothing real is near."""
+    rays = np.where(claim.is_sent.numpy(), (claim.num_ego_rays if by_ego else claim.num_rays).numpy(), 0)
     return not claim.is_near_real and is_checkable(rays)
 
 

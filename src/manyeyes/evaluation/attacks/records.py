@@ -32,7 +32,8 @@ class SenderRecord:
 class ClaimRecord:
     """One invented object, in each of F frames since the attack began.
 
-    is_sent: (F,) bool. num_rays: (F,) int64, rays that cross it, of the honest agent with most of them. is_near_real: a real object
+    is_sent: (F,) bool. num_rays: (F,) int64, rays that cross it, of the honest agent with most of them; num_ego_rays: of the ego.
+    is_near_real: a real object
     was within 1 m of it at any time. score: (F,) of the ego's best box within 2 m of it, without a real object as near; 0 without.
     evidence: (F,) int64 on that box, NO_EVIDENCE without; trust: (F,) in its sender, after the frame.
     """
@@ -43,6 +44,7 @@ class ClaimRecord:
     is_near_real: bool
     is_sent: Tensor
     num_rays: Tensor
+    num_ego_rays: Tensor
     score: Tensor
     evidence: Tensor
     trust: Tensor

@@ -35,6 +35,7 @@ class ClaimFrame:
     """A false claim in one frame, as in ClaimRecord."""
 
     num_rays: int
+    num_ego_rays: int
     is_near_real: bool
     score: float
     evidence: int
@@ -66,7 +67,7 @@ class DriveRecorder:
     def _describe_claims(
         self, snapshot: Snapshot, perception: Perception, world: Boxes, sender: int
     ) -> Iterable[ClaimFrame]:
-        rays = count_honest_rays(snapshot, world, self.malicious)
+        rays, ego_rays = count_honest_rays(snapshot, world, self.malicious, self.ego)
         truth = snapshot.truth.boxes.center[:, :2] if snapshot.truth else world.center[:0, :2]
         real_m = _nearest(world.center[:, :2], truth)
         ego = next(frame for frame in snapshot.frames if frame.agent_id == self.ego)
@@ -78,6 +79,7 @@ class DriveRecorder:
             best = int(torch.where(rests, scores, -1.0).argmax()) if bool(rests.any()) else -1
             yield ClaimFrame(
                 int(rays[row]),
+                int(ego_rays[row]),
                 bool(real_m[row] <= REAL_RADIUS_M),
                 float(scores[best]) if best >= 0 else 0.0,
                 find_evidence(perception, best),
@@ -90,7 +92,7 @@ class DriveRecorder:
 
     def claims(self) -> tuple[ClaimRecord, ...]:
         """Return the record of each false claim."""
-        absent, frames = ClaimFrame(0, False, 0.0, NO_EVIDENCE, 1.0), range(self.num_frames)
+        absent, frames = ClaimFrame(0, 0, False, 0.0, NO_EVIDENCE, 1.0), range(self.num_frames)
         return tuple(
             ClaimRecord(
                 self.ego,
@@ -99,6 +101,7 @@ class DriveRecorder:
                 any(row.is_near_real for row in rows.values()),
                 _booleans(at in rows for at in frames),
                 torch.tensor([rows.get(at, absent).num_rays for at in frames]),
+                torch.tensor([rows.get(at, absent).num_ego_rays for at in frames]),
                 torch.tensor([rows.get(at, absent).score for at in frames], dtype=torch.float64),
                 torch.tensor([rows.get(at, absent).evidence for at in frames]),
                 torch.tensor([rows.get(at, absent).trust for at in frames], dtype=torch.float64),
@@ -139,16 +142,17 @@ def find_evidence(perception: Perception, row: int) -> int:
     return NO_EVIDENCE if evidence is None or row < 0 else int(evidence.kinds[row])
 
 
-def count_honest_rays(snapshot: Snapshot, world: Boxes, malicious: frozenset[int]) -> Tensor:
-    """Return (N,) int64: rays that cross each box in the world, of the honest agent with most of them."""
-    num_rays = torch.zeros(len(world), dtype=torch.int64)
+def count_honest_rays(snapshot: Snapshot, world: Boxes, malicious: frozenset[int], ego: int) -> tuple[Tensor, Tensor]:
+    """Return (N,) int64, rays that cross each box in the world, of the honest agent with most of them, and of the ego."""
+    num_rays, num_ego_rays = (torch.zeros(len(world), dtype=torch.int64) for _ in range(2))
     for row, frame in enumerate(snapshot.frames):
         if frame.agent_id not in malicious:
             pose = snapshot.truth.world_from_agent[row] if snapshot.truth else frame.world_from_agent
-            num_rays = torch.maximum(
-                num_rays, torch.from_numpy(count_rays(frame, world.transform(pose.inverse())).num_crossing)
-            )
-    return num_rays
+            found = torch.from_numpy(count_rays(frame, world.transform(pose.inverse())).num_crossing)
+            num_rays = torch.maximum(num_rays, found)
+            if frame.agent_id == ego:
+                num_ego_rays = found
+    return num_rays, num_ego_rays
 
 
 def _nearest(points: Tensor, xy: Tensor) -> Tensor:

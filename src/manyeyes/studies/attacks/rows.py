@@ -70,8 +70,9 @@ class AttackRow:
 
     vs_clean: from nothing attacked and no defence; vs_oracle: from the run without the malicious agents' messages; vs_alone: from
     no fusion. named: fraction of malicious senders named within each of FIRST_FRAMES; named_checkable: of those with a checkable
-    claim. seen, blind: survival of checkable and of other false claims. removed: true objects that the clean run finds and this
-    one does not, of those that it finds. times: frames to detection, None never. accusations: false ones.
+    claim; named_by_ego: of those with a claim that the ego itself can check. seen, blind: survival of checkable and of other false
+    claims. removed: true objects that the clean run finds and this one does not, of those that it finds. times: frames to
+    detection, None never. accusations: false ones.
     """
 
     attack: str
@@ -86,6 +87,7 @@ class AttackRow:
     vs_alone: tuple[Interval, Interval] | None
     named: tuple[Proportion, ...]
     named_checkable: tuple[Proportion, ...]
+    named_by_ego: tuple[Proportion, ...]
     seen: Survival
     blind: Survival
     removed: Proportion
@@ -103,6 +105,7 @@ def make_row(results: AttackResults, key: Key) -> AttackRow:
     clean, oracle = (AttackCondition(NO_ATTACK, size, defence) for defence in (NO_DEFENCE, ORACLE))
     alone = AttackCondition(num_malicious=size), f"no-fusion{form_of(method)}"
     times, checkable = times_to_detection(drives), times_to_detection(drives, checkable=True)
+    by_ego = times_to_detection(drives, checkable=True, by_ego=True)
     is_clean, is_alone = key == (clean, method), method == alone[1]
     found = removed = 0
     if not is_alone:
@@ -120,6 +123,7 @@ def make_row(results: AttackResults, key: Key) -> AttackRow:
         None if is_alone else results.difference_pair(key, alone),
         tuple(detection_rate(times, frames) for frames in FIRST_FRAMES),
         tuple(detection_rate(checkable, frames) for frames in FIRST_FRAMES),
+        tuple(detection_rate(by_ego, frames) for frames in FIRST_FRAMES),
         measure_survival(drives, checkable=True),
         measure_survival(drives, checkable=False),
         Proportion.of(removed, found),

@@ -38,7 +38,8 @@ from manyeyes.viz.study_table import StudyTable, format_difference, format_inter
 
 NOTE = (
     "Named: malicious senders named within 5 and 10 frames of the attack, with Clopper-Pearson intervals. Survival: boxes of score "
-    ">= 0.5 that rest on a false claim, of claims sent; checkable: at least 10 rays of an honest agent cross it in 3 of 5 frames. "
+    ">= 0.5 that rest on a false claim, of claims sent; checkable: at least 10 rays of an honest agent cross it in 3 of 5 frames; "
+    "by the ego: rays of the ego itself do. "
     "Accusations: honest senders that become named, per sender-minute, with the one-sided 95 % upper bound."
 )
 
@@ -163,6 +164,7 @@ def _make_ap_table(title: str, rows: Sequence[AttackRow]) -> StudyTable:
 def _make_detection_table(title: str, rows: Sequence[AttackRow]) -> StudyTable:
     headings = (
         "attack", "malicious", "defence", "named <= 5", "named <= 10", "checkable, <= 5", "checkable, <= 10",
+        "by the ego, <= 5", "by the ego, <= 10",
         "survival, checkable", "survival, other", "ROC area", "accusations/min",
     )  # fmt: skip
     lines = tuple(
@@ -170,7 +172,7 @@ def _make_detection_table(title: str, rows: Sequence[AttackRow]) -> StudyTable:
             row.attack,
             str(row.num_malicious),
             row.defence,
-            *map(_format_proportion, (*row.named, *row.named_checkable)),
+            *map(_format_proportion, (*row.named, *row.named_checkable, *row.named_by_ego)),
             *map(_format_survival, (row.seen, row.blind)),
             "" if row.roc is None else f"{row.roc.area:.3f}",
             _format_accusations(row),
