@@ -178,6 +178,7 @@ def stopped_ego(team: Team, options: Options) -> Outcome:
 
 def flood(team: Team, options: Options) -> Outcome:
     """Send 20,000 forged packets a second from a process without a key of the federation."""
+    team.collect(2.0)  # links are known after a second
     before = {agent_id: rss_bytes(process)[0] for agent_id, process in team.processes.items()}
     child = os.fork()
     if child == 0:

@@ -15,7 +15,14 @@ from manyeyes.comms.signatures.certificate import SENDER_RIGHTS, Area, make_iden
 from manyeyes.comms.signatures.envelope import SIGNED, SIGNED_WITH_CERTIFICATE
 from manyeyes.comms.wire import encode
 from manyeyes.datatypes import Boxes, Message, Transform
-from manyeyes.runtime.authentication import MAX_UNSIGNED, MAX_VERIFICATIONS, REPLAY_STAMPS, PacketVerifier
+from manyeyes.runtime.authentication import (
+    FORGED_INSTANTS,
+    MAX_FORGED_VERIFICATIONS,
+    MAX_UNSIGNED,
+    MAX_VERIFICATIONS,
+    REPLAY_STAMPS,
+    PacketVerifier,
+)
 from manyeyes.runtime.keys import Identity, Issuer, Validity, generate_key, public_bytes
 from manyeyes.runtime.signing import PacketSigner
 from manyeyes.runtime.trust_file import Anchor, Revocations, Trust
@@ -245,4 +252,26 @@ def test_links_share_the_verifications_of_an_instant(federation: Federation) -> 
         inbox.push(forged, stamp, Origin("flood"))
     (got,) = inbox.messages(NOW + 2 * TENTH_NS)
     assert got.agent_id == 2 and got.timestamp_ns == NOW + 2 * TENTH_NS
-    assert inbox.dropped.busy > 100 and inbox.dropped.forged <= 3 * MAX_VERIFICATIONS
+    assert inbox.dropped.busy > 100 and inbox.dropped.forged <= 3 * MAX_FORGED_VERIFICATIONS
+
+
+def test_a_link_with_forged_packets_has_fewer_verifications_for_a_second(federation: Federation) -> None:
+    signer, verifier = PacketSigner(federation.identity(1)), PacketVerifier(federation.trust)
+    inbox = Inbox(authenticator=verifier)
+
+    def count_verified(instant: int, *packets: bytes) -> int:
+        """Of one packet in 60 messages of the instant's signer, how many are verified after others on their link."""
+        stamp, before = NOW + instant * TENTH_NS, inbox.dropped.busy
+        for packet in packets:
+            inbox.push(packet, stamp, Origin("link"))
+        many = [signer.sign(make_message(1, stamp + k, num_boxes=1), stamp)[0] for k in range(60)]
+        for packet in many:
+            inbox.push(packet, stamp, Origin("link"))
+        return 60 - (inbox.dropped.busy - before)
+
+    assert count_verified(0) == 60 and inbox.dropped.busy == inbox.dropped.unknown_signer == 0
+    forged = bytearray(signer.sign(make_message(1, NOW + TENTH_NS, num_boxes=1), NOW)[0])
+    forged[-1] ^= 1
+    assert count_verified(1, bytes(forged)) == MAX_FORGED_VERIFICATIONS - 1
+    assert count_verified(5) == MAX_FORGED_VERIFICATIONS
+    assert count_verified(1 + FORGED_INSTANTS + 1) == 60

@@ -34,6 +34,9 @@ NS_PER_S = 1_000_000_000
 INSTANT_NS = 100_000_000
 MAX_VERIFICATIONS = 200
 """Number of signatures that are verified in INSTANT_NS of arrivals, 30 ms of CPU time."""
+MAX_FORGED_VERIFICATIONS = 32
+"""The same of one link from which a forged packet came within FORGED_INSTANTS."""
+FORGED_INSTANTS = 10
 MAX_TICKETS = 1_024
 """Number of verified certificates that are kept; the one that was not used for longest gives way."""
 REPLAY_STAMPS = 8
@@ -76,11 +79,12 @@ class _Ticket:
 
 
 class _Quota:
-    """Number of verifications in an instant, shared evenly among the links of this and the last instant."""
+    """Number of verifications in an instant, shared evenly among the links of this and the last instant; forging links get less."""
 
     def __init__(self) -> None:
         self._instant, self._total = 0, 0
         self._used: dict[str, int] = {}
+        self._forged: dict[str, int] = {}
         self._last: frozenset[str] = frozenset()
 
     def take(self, link: str, now_ns: int) -> bool:
@@ -88,14 +92,21 @@ class _Quota:
         if instant != self._instant:
             self._last = frozenset(self._used) if instant == self._instant + 1 else frozenset()
             self._instant, self._total, self._used = instant, 0, {}
+            self._forged = {one: at for one, at in self._forged.items() if 0 <= instant - at <= FORGED_INSTANTS}
         used = self._used.get(link, 0)
         self._used[link] = used + 1
         # One share is left for a link that is new.
         share = max(1, MAX_VERIFICATIONS // (1 + len(self._last | self._used.keys())))
+        if link in self._forged:
+            share = min(share, MAX_FORGED_VERIFICATIONS)
         if self._total >= MAX_VERIFICATIONS or used >= share:
             return False
         self._total += 1
         return True
+
+    def record_forged(self, link: str) -> None:
+        """Record that a packet of a link that was verified last was forged."""
+        self._forged[link] = self._instant
 
 
 @dataclass
@@ -154,6 +165,7 @@ class PacketVerifier:
         if not self._quota.take(origin.link, now_ns):
             return "busy"
         if not is_signature(ticket.public_key, signed.signature, signed.content):
+            self._quota.record_forged(origin.link)
             return "forged"
         ticket.take(header.timestamp_ns, envelope.number)
         self._tickets.move_to_end(signed.signer)

@@ -4,6 +4,9 @@
 Each tile (``comms.network.tiles``) of each network has a group in 239.0.0.0/8 by a hash of both names; agents join the groups of
 their tile and of the eight around it. A datagram is ``MU``, 8 bytes of that hash, the indices i, j of the tile (2 x i32,
 little-endian), and the packet: the groups of two tiles may coincide, their hashes do not.
+
+Links that are known have sockets of their own (``link_sockets``), so that a flood from others neither fills their buffers nor takes
+more than a bounded time.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ import select
 import socket
 import struct
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -21,6 +25,7 @@ from manyeyes.comms.network.interface import Origin, ReceivedPacket
 from manyeyes.comms.network.link_rings import LinkRings
 from manyeyes.comms.network.tiles import NetworkTile
 from manyeyes.datatypes import ConfigError
+from manyeyes.runtime.transports.link_sockets import LinkSockets, ReadBudget, Sender
 
 DEFAULT_PORT = 17_448
 _MAGIC = b"MU"
@@ -28,6 +33,12 @@ _HEADER = struct.Struct("<2s8s2i")
 _RECEIVE_BYTES = 1 << 20
 _MAX_DATAGRAM = 65_535
 _POLL_S = 0.2
+_COMMON_RATE, _COMMON_BURST = 2_000.0, 500.0
+"""Datagrams a second that are read from the common socket, which links without one of their own share."""
+_REFILL_S = 0.005
+_MAX_TURN = 64
+"""Datagrams of one socket before the others have their turn."""
+_MAX_DRAINED = 1_000
 
 
 @dataclass(frozen=True)
@@ -62,6 +73,8 @@ class UdpNetwork:
             raise ConfigError(f"UDP multicast on {config.interface}, port {config.port}: {error}.") from error
         # With the port, the address of a packet of this agent.
         self._own_port = self._sender.getsockname()[1]
+        self._links = LinkSockets(config.port, time.monotonic)
+        self._budget = ReadBudget(_COMMON_RATE, _COMMON_BURST, time.monotonic)
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._receive, name="udp", daemon=True)
         self._thread.start()
@@ -111,6 +124,7 @@ class UdpNetwork:
         """Stop the thread and close the sockets."""
         self._stopped.set()
         self._thread.join()
+        self._links.close()
         self._receiver.close()
         self._sender.close()
 
@@ -136,21 +150,77 @@ class UdpNetwork:
             raise ConfigError(f"Multicast group {group} on {self._config.interface}: {error}.") from error
 
     def _receive(self) -> None:
-        buffer = memoryview(bytearray(_MAX_DATAGRAM))
+        buffer, has_budget = memoryview(bytearray(_MAX_DATAGRAM)), True
         while not self._stopped.is_set():
-            ready, _, _ = select.select([self._receiver], [], [], _POLL_S)
-            while ready and not self._stopped.is_set():
-                try:
-                    size, (host, port) = self._receiver.recvfrom_into(buffer)
-                except OSError:  # nothing is left
-                    break
+            receivers = self._links.receivers()
+            waiting = [*receivers.values(), *([self._receiver] if has_budget else [])]
+            select.select(waiting, [], [], _POLL_S if has_budget else _REFILL_S)
+            for sender, receiver in receivers.items():
+                self._read_link(sender, receiver, buffer)
+            has_budget = self._read_common(buffer)
+            self._links.close_silent()
+
+    def _read_link(
+        self, sender: Sender, receiver: socket.socket, buffer: memoryview, taken: frozenset[bytes] = frozenset()
+    ) -> None:
+        """Read the socket of a link; taken: datagrams that came by the common one already."""
+        host, port, _ = sender
+        for _ in range(_MAX_TURN):
+            size = _receive_into(receiver, buffer)
+            if size is None:
+                return
+            if not taken or bytes(buffer[:size]) not in taken:
                 self._put(buffer[:size], host, port)
+            self._links.count(sender)
+            if sender not in self._links:
+                return
+
+    def _read_common(self, buffer: memoryview) -> bool:
+        """Read the common socket; return whether more may be read at once."""
+        for _ in range(_MAX_TURN):
+            if not self._budget.take():
+                return False
+            try:
+                size, (host, port) = self._receiver.recvfrom_into(buffer)
+            except OSError:  # nothing is left
+                return True
+            sender = self._find_sender(buffer[:size], host, port)
+            if sender is None or sender in self._links:
+                continue
+            self._put(buffer[:size], host, port)
+            if self._links.observe(sender):
+                self._open_link(sender, buffer)
+        return True
+
+    def _open_link(self, sender: Sender, buffer: memoryview) -> None:
+        """Give a link a socket, so that none of its datagrams is lost or comes twice."""
+        receiver = self._links.open(sender)
+        if receiver is None:
+            return
+        # Those before the connection are in the common socket alone, later ones in both.
+        taken = set[bytes]()
+        for _ in range(_MAX_DRAINED):
+            try:
+                size, (host, port) = self._receiver.recvfrom_into(buffer)
+            except OSError:
+                break
+            found = self._find_sender(buffer[:size], host, port)
+            if found is not None and (found == sender or found not in self._links):
+                self._put(buffer[:size], host, port)
+                taken |= {bytes(buffer[:size])} if found == sender else set()
+        self._read_link(sender, receiver, buffer, frozenset(taken))
+
+    def _find_sender(self, data: memoryview, host: str, port: int) -> Sender | None:
+        """Return who sent a datagram of this network, from a tile around; None of others and of the agent's own."""
+        if len(data) < _HEADER.size or (port == self._own_port and host == self._config.interface):
+            return None
+        magic, scope, i, j = _HEADER.unpack_from(data)
+        if magic != _MAGIC or scope != self._scopes.get(NetworkTile(i, j)):
+            return None
+        return host, port, _group_of(scope)
 
     def _put(self, data: memoryview, host: str, port: int) -> None:
-        """Store the packet of a datagram of this network and of a tile around, unless it is the agent's own."""
-        tile = self._tile
-        if len(data) < _HEADER.size or tile is None or (port == self._own_port and host == self._config.interface):
-            return
+        """Store the packet of a datagram of this network and of a tile around."""
         magic, scope, i, j = _HEADER.unpack_from(data)
         sent_in = NetworkTile(i, j)
         if magic == _MAGIC and scope == self._scopes.get(sent_in):
@@ -160,5 +230,16 @@ class UdpNetwork:
         return hashlib.sha256(f"manyeyes/{self._config.network}/3/{tile.name}".encode()).digest()[:8]
 
     def _group(self, tile: NetworkTile) -> str:
-        scope = self._scope(tile)
-        return f"239.{scope[0]}.{scope[1]}.{scope[2]}"
+        return _group_of(self._scope(tile))
+
+
+def _group_of(scope: bytes) -> str:
+    return f"239.{scope[0]}.{scope[1]}.{scope[2]}"
+
+
+def _receive_into(receiver: socket.socket, buffer: memoryview) -> int | None:
+    """Receive a datagram; None where nothing is left."""
+    try:
+        return receiver.recv_into(buffer)
+    except OSError:
+        return None
