@@ -3,6 +3,7 @@
 
 import tracemalloc
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -20,13 +21,13 @@ from manyeyes.maps.store.executors import InlineExecutor, make_executor
 from manyeyes.maps.store.log_index import IndexRow, LogIndex
 from manyeyes.maps.store.object_store import FolderStore
 from manyeyes.maps.store.observation_log import read_active
+from manyeyes.maps.store.region_release import assemble_map
 from manyeyes.maps.store.store import MapStore
 from manyeyes.maps.store.tiled_fusion import (
     FusionJob,
     FusionStepResult,
     TiledFusionConfig,
     fuse_and,
-    fuse_tiles,
     iterate_blocks,
 )
 from manyeyes.simulator.fleet import CROWDS, load_place, simulate_crowd
@@ -59,7 +60,8 @@ def store(crowd, tmp_path):
 def _tiled(store, work, tile_m, executor=None, progress=None, config=None):
     job = FusionJob(store.objects, FolderStore(work), config or MapFusionConfig())
     with (executor or InlineExecutor()).open() as session:
-        return fuse_tiles(job, store.log.index, store.frame, session, TiledFusionConfig(tile_m, 1), progress)
+        use = partial(assemble_map, job, frame=store.frame)
+        return fuse_and(use, job, store.log.index, TiledFusionConfig(tile_m, 1), session, progress)
 
 
 @pytest.mark.slow

@@ -259,9 +259,29 @@ class VectorMap:
         """Compute BLAKE2b-128 over kind, state and geometry on a grid of cell_cm; order, direction and a ring's start have no
         effect.
         """
-        digests = compute_element_digests(self.elements, self.state, cell_cm)
-        order = np.lexsort(digests.T[::-1])
-        return hashlib.blake2b(digests[order].tobytes(), digest_size=16).hexdigest()
+        return ContentSum.of(self, cell_cm).hexdigest()
+
+
+@dataclass(frozen=True)
+class ContentSum:
+    """The sum of the digests of a map's elements modulo 2^128, and their number: sums of parts add up to that of the whole."""
+
+    total: int = 0
+    count: int = 0
+
+    @classmethod
+    def of(cls, vector_map: VectorMap, cell_cm: float = 1.0) -> ContentSum:
+        """Return the sum of a map, or of a part of one."""
+        digests = compute_element_digests(vector_map.elements, vector_map.state, cell_cm)
+        return cls(sum(int.from_bytes(row.tobytes(), "little") for row in digests) % (1 << 128), len(digests))
+
+    def __add__(self, other: ContentSum) -> ContentSum:
+        return ContentSum((self.total + other.total) % (1 << 128), self.count + other.count)
+
+    def hexdigest(self) -> str:
+        """Return BLAKE2b-128 of both, in hexadecimal."""
+        data = self.total.to_bytes(16, "little") + self.count.to_bytes(8, "little")
+        return hashlib.blake2b(data, digest_size=16).hexdigest()
 
 
 _COUNTS = ("state", "supporters", "agents", "t_first", "t_last")

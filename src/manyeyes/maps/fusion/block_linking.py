@@ -9,7 +9,7 @@ across a border stays where both squares have it. So the map is defined by squar
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -41,6 +41,14 @@ class LinkedStations:
     is_observed: Flags
     linked: Ints
     outside: Floats
+
+    def take(self, rows: Ints) -> LinkedStations:
+        """Return the chosen stations, ascending, with the links among them; crossings and ground stay."""
+        place = np.full(len(self.table) + 1, -1)
+        place[rows] = np.arange(len(rows))
+        line = self.table.line_evidence.take(rows)
+        table = replace(self.table, xy=self.table.xy[rows], tangent=self.table.tangent[rows], line_evidence=line)
+        return LinkedStations(table, self.is_observed[rows], place[self.linked[rows]], self.outside[rows])
 
 
 def find_block_area(block: Place, config: LinkConfig) -> Area:
@@ -140,7 +148,10 @@ def _link_rows(
 
 
 def stitch_blocks(blocks: Sequence[LinkedStations]) -> LinkedStations:
-    """Merge all blocks, in any order: a link between two of them stays where both have it."""
+    """Merge blocks, in any order: a link between two of them stays where both have it.
+
+    ``outside`` names the stations of other blocks that could not be linked, for instance since their block is not among these.
+    """
     xy = np.concatenate([b.table.xy for b in blocks])
     evidence = EvidenceTable.cat([b.table.line_evidence for b in blocks])
     is_observed = np.concatenate([b.is_observed for b in blocks])
@@ -148,6 +159,7 @@ def stitch_blocks(blocks: Sequence[LinkedStations]) -> LinkedStations:
     linked = np.concatenate([np.where(b.linked >= 0, b.linked + start, -1) for b, start in zip(blocks, starts)])
     outside = np.concatenate([b.outside for b in blocks])
     linked = _join_borders(xy, evidence, linked, outside)
+    outside = np.where((linked >= 0)[..., None], np.nan, outside)
     # Rings and ground merge as those of areas do.
     table = StationTable.cat([b.table for b in blocks])
     order = np.lexsort((xy[:, 1], xy[:, 0], evidence.kind, ~is_observed))
@@ -163,7 +175,7 @@ def stitch_blocks(blocks: Sequence[LinkedStations]) -> LinkedStations:
         table.ring_evidence,
         table.observed_cells,
     )
-    return LinkedStations(merged, is_observed[order], place[linked[order]], np.full_like(outside, np.nan))
+    return LinkedStations(merged, is_observed[order], place[linked[order]], outside[order])
 
 
 def _join_borders(xy: Floats, evidence: EvidenceTable, linked: Ints, outside: Floats) -> Ints:

@@ -10,7 +10,7 @@ observations: repetition and order have no effect, and removing an observation g
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +96,13 @@ def assemble_linked(
     stations: LinkedStations, config: MapFusionConfig = MapFusionConfig(), frame: MapFrame | None = None
 ) -> VectorMap:
     """Assemble the map from the linked stations of all blocks."""
+    return relate_elements(assemble_elements(stations, config, frame))
+
+
+def assemble_elements(
+    stations: LinkedStations, config: MapFusionConfig = MapFusionConfig(), frame: MapFrame | None = None
+) -> VectorMap:
+    """Assemble lines and crossings from linked stations, without relations among them."""
     table = stations.table
     is_retired = table.line_evidence.state == RETIRED
     parts = [_build_lines(stations, np.flatnonzero(chosen), config) for chosen in (~is_retired, is_retired)]
@@ -208,17 +215,17 @@ def _to_vector_map(parts: _ElementParts, evidence: EvidenceTable, frame: MapFram
         t_first=t_first,
         t_last=t_last,
         point_evidence=stations,
-        topology=_build_topology(elements, state),
+        topology=Topology.empty(),
         observations=evidence.observations,
         source_offsets=source_offsets,
         sources=sources,
     )
 
 
-def _build_topology(elements: MapElements, state: Ints) -> Topology:
-    """Relations among the elements that are not retired."""
-    alive = np.flatnonzero(state != RETIRED)
-    return build_topology(elements.take(alive)).renumber(alive)
+def relate_elements(vector_map: VectorMap) -> VectorMap:
+    """Return the map with the relations among its elements that are not retired."""
+    alive = np.flatnonzero(vector_map.state != RETIRED)
+    return replace(vector_map, topology=build_topology(vector_map.elements.take(alive)).renumber(alive))
 
 
 def _collect_sources(owner: Ints, row: Ints, count: int, evidence: EvidenceTable) -> tuple[Ints, Ints]:

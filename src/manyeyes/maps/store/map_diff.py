@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +28,7 @@ Ints = NDArray[np.int64]
 _MATCH_RADIUS_M = 1.0
 _MIN_FRACTION = 0.5
 _FILES = ("lines.parquet", "crossings.parquet")
+_VERSION = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,20 +74,25 @@ def compute_home_tiles(vector_map: VectorMap) -> Ints:
     return tile_indices(start)
 
 
-def compute_delta(before: VectorMap, after: VectorMap) -> MapDelta:
-    """What to add, modify and delete to come from one map to the other; equal to 1 cm, in one state, is unchanged."""
+def compute_delta(before: VectorMap, after: VectorMap, own: Ints | None = None, former: Ints | None = None) -> MapDelta:
+    """What to add, modify and delete to come from one map to the other; equal to 1 cm, in one state, is unchanged.
+
+    own: rows of ``after`` that count; former: rows of ``before`` that may be gone. By default all: a part of a map has its own
+    rows, and around them what their ids are compared with.
+    """
+    own = np.arange(len(after)) if own is None else own
+    former = np.arange(len(before)) if former is None else former
     old, new = to_hex_ids(before.id), to_hex_ids(after.id)
     old_digests = dict(zip(old, compute_element_digests(before.elements, before.state, 1.0).tolist()))
-    new_digests = dict(zip(new, compute_element_digests(after.elements, after.state, 1.0).tolist()))
-    rows = [k for k, name in enumerate(new) if old_digests.get(name) != new_digests[name]]
-    deleted = sorted(set(old) - set(new))
-    place = {name: k for k, name in enumerate(old)}
-    deleted_rows = np.array([place[name] for name in deleted], np.int64)
+    new_digests = compute_element_digests(after.elements.take(own), after.state[own], 1.0).tolist()
+    rows = [k for k, digest in zip(own.tolist(), new_digests) if old_digests.get(new[k]) != digest]
+    kept = set(new)
+    gone = sorted((old[k], k) for k in former.tolist() if old[k] not in kept)
     return MapDelta(
         changed=after.take(np.array(rows, np.int64)),
-        added=tuple(sorted(set(new) - set(old))),
-        deleted=tuple(deleted),
-        deleted_tiles=compute_home_tiles(before)[deleted_rows],
+        added=tuple(sorted(new[k] for k in own.tolist() if new[k] not in old_digests)),
+        deleted=tuple(name for name, _ in gone),
+        deleted_tiles=compute_home_tiles(before)[np.array([k for _, k in gone], np.int64)],
     )
 
 
@@ -97,51 +104,61 @@ def apply_delta(before: VectorMap, delta: MapDelta) -> VectorMap:
     return after.take(np.lexsort(after.id.T[::-1]))
 
 
-def write_delta(delta: MapDelta, objects: ObjectStore, folder: str) -> None:
-    """Write a delta: ``lines.parquet`` and ``crossings.parquet`` of what changed, then ``delta.json`` with the rest."""
+def write_delta(delta: MapDelta, objects: ObjectStore, folder: str, part: str) -> None:
+    """Write the part of a delta: ``PART.lines.parquet`` and ``PART.crossings.parquet`` of what changed, then ``PART.json``."""
     for name, data in zip(_FILES, map_to_bytes(delta.changed)):
-        objects.put(f"{folder}/{name}", data)
+        objects.put(f"{folder}/{part}.{name}", data)
     tiles = [
         {"x": x, "y": y, "added": added, "modified": modified, "deleted": deleted}
         for (x, y), added, modified, deleted in delta.by_tile()
     ]
     gone = [{"id": name, "tile": tile} for name, tile in zip(delta.deleted, delta.deleted_tiles.tolist(), strict=True)]
-    text = json.dumps({"version": 1, "added": list(delta.added), "deleted": gone, "tiles": tiles}, indent=1)
-    objects.put(f"{folder}/delta.json", text.encode())
+    text = json.dumps({"added": list(delta.added), "deleted": gone, "tiles": tiles}, indent=1)
+    objects.put(f"{folder}/{part}.json", text.encode())
+
+
+def write_delta_parts(parts: Sequence[str], objects: ObjectStore, folder: str) -> None:
+    """Write ``delta.json``, which names the parts of a delta; it is whole from then on."""
+    objects.put(f"{folder}/delta.json", json.dumps({"version": _VERSION, "parts": list(parts)}, indent=1).encode())
 
 
 def read_delta(objects: ObjectStore, folder: str) -> MapDelta:
-    """Return a delta that :func:`write_delta` wrote."""
+    """Return a delta from its parts; of version 1, from its one part."""
     place = f"{objects.location}/{folder}"
     try:
         content = json.loads(objects.get(f"{folder}/delta.json"))
-        gone = content["deleted"]
-        tiles = np.array([one["tile"] for one in gone], np.int64).reshape(-1, 2)
-        added, deleted = tuple(content["added"]), tuple(one["id"] for one in gone)
+        prefixes = [""] if content["version"] == 1 else [f"{name}." for name in content["parts"]]
+        parts = (
+            [content] if content["version"] == 1 else [json.loads(objects.get(f"{folder}/{p}json")) for p in prefixes]
+        )
+        gone = sorted((one["id"], tuple(one["tile"])) for part in parts for one in part["deleted"])
+        tiles = np.array([tile for _, tile in gone], np.int64).reshape(-1, 2)
+        added = tuple(sorted(name for part in parts for name in part["added"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         reason = " ".join(str(error).split())
         raise MapFileError(f"{place}: expected the delta of a map; {type(error).__name__} {reason}.") from None
-    changed = bytes_to_map((f"{place}/{name}", objects.get(f"{folder}/{name}")) for name in _FILES)
-    return MapDelta(changed, added, deleted, tiles)
+    files = [f"{prefix}{name}" for prefix in prefixes for name in _FILES]
+    changed = bytes_to_map((f"{place}/{name}", objects.get(f"{folder}/{name}")) for name in files)
+    return MapDelta(changed, added, tuple(name for name, _ in gone), tiles)
 
 
 def transfer_ids(after: VectorMap, before: VectorMap) -> VectorMap:
     """Return the map with the ids of the elements of an earlier one that its own continue; the others keep theirs.
 
-    Each old element is continued by at most one new one: the largest share of common points first, then the smaller ids.
+    A new element continues an old one if each is the best for the other: that of the same content, else the largest share of
+    common points, then the smaller id. So what is decided depends on the elements around alone, and regions decide the same.
     """
     old, new = to_hex_ids(before.id), to_hex_ids(after.id)
     same = set(old) & set(new)
     rows_new = np.array([k for k, name in enumerate(new) if name not in same], np.int64)
     rows_old = np.array([k for k, name in enumerate(old) if name not in same], np.int64)
-    pairs = _find_overlaps(after, rows_new, before, rows_old)
     ids = after.id.copy()
-    assigned: set[int] = set()
-    continued: set[int] = set()
-    for _, _, _, row, twin in sorted((-share, new[a], old[b], a, b) for share, a, b in pairs):
-        if row not in assigned and twin not in continued:
-            assigned.add(row)
-            continued.add(twin)
+    best_new, best_old = dict[int, tuple[float, str, int]](), dict[int, tuple[float, str, int]]()
+    for share, row, twin in _find_overlaps(after, rows_new, before, rows_old):
+        best_old[row] = min(best_old.get(row, (1.0, "", -1)), (-share, old[twin], twin))
+        best_new[twin] = min(best_new.get(twin, (1.0, "", -1)), (-share, new[row], row))
+    for row, (_, _, twin) in best_old.items():
+        if best_new[twin][2] == row:
             ids[row] = before.id[twin]
     return replace(after, id=ids)
 

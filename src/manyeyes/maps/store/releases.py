@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from manyeyes.maps.elements.observation import MapFrame
-from manyeyes.maps.elements.vector_map import VectorMap
+from manyeyes.maps.elements.vector_map import ContentSum, VectorMap
 from manyeyes.maps.formats.geoparquet import bytes_to_map, map_to_bytes
 from manyeyes.maps.store.map_diff import (
     MapDelta,
@@ -26,9 +27,13 @@ from manyeyes.maps.store.map_diff import (
     read_delta,
     transfer_ids,
     write_delta,
+    write_delta_parts,
 )
 from manyeyes.maps.store.object_store import ObjectNotFoundError, ObjectStore, StoreError
 from manyeyes.maps.store.observation_log import TILE_M
+from manyeyes.maps.store.region_assembly import Bounds
+
+Ints = NDArray[np.int64]
 
 STORE_VERSION = 1
 _KINDS = ("lines", "crossings")
@@ -45,13 +50,26 @@ class Watermark:
 
 @dataclass(frozen=True)
 class TileEntry:
-    """One tile of a release: column, row, elements, names of its two objects below ``tiles``, and their BLAKE2b-128 hashes."""
+    """One tile of a release: column, row, elements, names of its two objects below ``tiles``, and their BLAKE2b-128 hashes.
+
+    bounds: box of its elements, metres; None in releases of earlier versions of this program.
+    """
 
     x: int
     y: int
     elements: int
     files: tuple[str, str]
     hashes: tuple[str, str]
+    bounds: Bounds | None = None
+
+
+@dataclass(frozen=True)
+class ReleasePart:
+    """What was written of a release: its tiles, the sum of their elements, and the name of the part of the delta ("": none)."""
+
+    tiles: tuple[TileEntry, ...]
+    content: ContentSum
+    delta: str
 
 
 @dataclass(frozen=True)
@@ -98,9 +116,9 @@ class ReleaseStore:
         """
         manifest = self.manifest(number)
         tiles = [tile for tile in manifest.tiles if area is None or _touches(tile, area)]
-        return bytes_to_map(self._tile_files(manifest, tiles)) if tiles else VectorMap.empty(self.frame)
+        return self.read_tiles(manifest.number, tiles)
 
-    def _tile_files(self, manifest: Manifest, tiles: list[TileEntry]) -> Iterator[tuple[str, bytes]]:
+    def _tile_files(self, number: int, tiles: Sequence[TileEntry]) -> Iterator[tuple[str, bytes]]:
         """Yield name and bytes of the objects of tiles."""
         for tile in tiles:
             for name, digest in zip(tile.files, tile.hashes):
@@ -110,30 +128,64 @@ class ReleaseStore:
                 except ObjectNotFoundError:
                     data = b""
                 if hash_bytes(data) != digest:
-                    raise StoreError(
-                        f"{place}: missing or damaged in release {manifest.number}; restore it from a copy."
-                    )
+                    raise StoreError(f"{place}: missing or damaged in release {number}; restore it from a copy.")
                 yield place, data
 
     def write(self, fused: VectorMap, algorithm: str, settings: str, watermark: Watermark) -> Manifest:
         """Write the objects of the next release; it is there once :meth:`commit` has created its manifest."""
-        numbers = self.numbers()
-        parent = numbers[-1] if numbers else 0
+        parent, known = self.parent()
         before = self.read(parent) if parent else VectorMap.empty(self.frame)
-        known = self.manifest(parent).tiles if parent else ()
-        fused, number = transfer_ids(fused, before), parent + 1
-        tiles = self._write_tiles(fused, {name for tile in known for name in tile.files})
-        write_delta(compute_delta(before, fused), self.objects, _delta_folder(number))
+        after, number = transfer_ids(fused, before), parent + 1
+        part = self.write_part("all", number, before, after, np.arange(len(after)), np.arange(len(before)), known)
+        return self.finish([part], number, algorithm, settings, watermark)
+
+    def parent(self) -> tuple[int, tuple[TileEntry, ...]]:
+        """Return the number of the last release and its tiles; 0 and none before the first."""
+        numbers = self.numbers()
+        return (numbers[-1], self.manifest(numbers[-1]).tiles) if numbers else (0, ())
+
+    def read_tiles(self, number: int, tiles: Sequence[TileEntry]) -> VectorMap:
+        """Return the elements of some tiles of a release."""
+        return bytes_to_map(self._tile_files(number, tiles)) if tiles else VectorMap.empty(self.frame)
+
+    def write_part(
+        self,
+        name: str,
+        number: int,
+        before: VectorMap,
+        after: VectorMap,
+        own: Ints,
+        former: Ints,
+        known: Sequence[TileEntry],
+    ) -> ReleasePart:
+        """Write the tiles and the delta of a part of a release.
+
+        own: the part's rows of ``after``, which has their relations. former: rows of ``before`` that stood in its tiles. known:
+        tiles of the release before; equal ones are not written again.
+        """
+        tiles = self._write_tiles(after, own, {name for tile in known for name in tile.files})
+        delta = compute_delta(before, after, own, former)
+        changes = bool(len(delta.changed) or delta.deleted)
+        if changes:
+            write_delta(delta, self.objects, _delta_folder(number), name)
+        return ReleasePart(tiles, ContentSum.of(after.take(own)), name if changes else "")
+
+    def finish(
+        self, parts: Sequence[ReleasePart], number: int, algorithm: str, settings: str, watermark: Watermark
+    ) -> Manifest:
+        """Return the manifest of a release whose parts are written."""
+        write_delta_parts([part.delta for part in parts if part.delta], self.objects, _delta_folder(number))
+        content = sum((part.content for part in parts), ContentSum())
         return Manifest(
             number=number,
-            parent=parent,
-            content=fused.quantised_hash(),
-            elements=len(fused),
+            parent=number - 1,
+            content=content.hexdigest(),
+            elements=content.count,
             algorithm=algorithm,
             settings=settings,
             settings_hash=hash_bytes(settings.encode()),
             watermark=watermark,
-            tiles=tiles,
+            tiles=tuple(sorted((tile for part in parts for tile in part.tiles), key=lambda tile: (tile.x, tile.y))),
         )
 
     def commit(self, manifest: Manifest) -> None:
@@ -159,20 +211,22 @@ class ReleaseStore:
         self.objects.delete(left)
         return sorted(left)
 
-    def _write_tiles(self, fused: VectorMap, known: set[str]) -> tuple[TileEntry, ...]:
-        """Write the objects of every tile that are not known; entries by column and row."""
-        keys = compute_home_tiles(fused)
+    def _write_tiles(self, fused: VectorMap, own: Ints, known: set[str]) -> tuple[TileEntry, ...]:
+        """Write the objects of every tile of the rows that are not known; entries by column and row."""
+        own = own[np.lexsort(fused.id[own].T[::-1])]
+        keys, bounds = compute_home_tiles(fused)[own], fused.elements.bounds()
         entries = []
-        by_id = np.lexsort(fused.id.T[::-1])
         for x, y in np.unique(keys, axis=0).tolist() if len(keys) else []:
-            rows = by_id[(keys[by_id] == (x, y)).all(1)]
+            rows = own[(keys == (x, y)).all(1)]
             files, hashes = [], []
             for kind, data in zip(_KINDS, map_to_bytes(fused, rows)):
                 hashes.append(hash_bytes(data))
                 files.append(f"{x}_{y}/{hashes[-1]}.{kind}.parquet")
                 if files[-1] not in known:
                     self.objects.put_new(f"tiles/{files[-1]}", data)
-            entries.append(TileEntry(x, y, len(rows), (files[0], files[1]), (hashes[0], hashes[1])))
+            low, high = bounds[rows, :2].min(0).tolist(), bounds[rows, 2:].max(0).tolist()
+            box = (low[0], low[1], high[0], high[1])
+            entries.append(TileEntry(x, y, len(rows), (files[0], files[1]), (hashes[0], hashes[1]), box))
         return tuple(entries)
 
 
@@ -192,12 +246,17 @@ def _read_manifest(objects: ObjectStore, key: str) -> Manifest:
         )
     try:
         tiles = tuple(
-            TileEntry(t["x"], t["y"], t["elements"], tuple(t["files"]), tuple(t["hashes"])) for t in content["tiles"]
+            TileEntry(t["x"], t["y"], t["elements"], tuple(t["files"]), tuple(t["hashes"]), _to_bounds(t.get("bounds")))
+            for t in content["tiles"]
         )
         names = ("number", "parent", "content", "elements", "algorithm", "settings", "settings_hash")
         return Manifest(**{n: content[n] for n in names}, watermark=Watermark(**content["watermark"]), tiles=tiles)
     except (KeyError, TypeError) as error:
         raise StoreError(f"{place}: expected the manifest of a release; {type(error).__name__} {error}.") from None
+
+
+def _to_bounds(stored: list[float] | None) -> Bounds | None:
+    return None if stored is None else (stored[0], stored[1], stored[2], stored[3])
 
 
 def read_json(objects: ObjectStore, key: str, expected: str) -> dict[str, Any]:

@@ -23,7 +23,7 @@ import os
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 
@@ -34,20 +34,14 @@ from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.fusion.fuse import MapFusionConfig
 from manyeyes.maps.isolation import FailedObservationsError
-from manyeyes.maps.store.executors import Executor, ProcessExecutor, map_blocks
+from manyeyes.maps.store.executors import Executor, ProcessExecutor
 from manyeyes.maps.store.log_index import ActiveObservations
 from manyeyes.maps.store.map_diff import MapDelta
 from manyeyes.maps.store.object_store import FolderStore, ObjectNotFoundError, StoreError, open_object_store
 from manyeyes.maps.store.observation_log import ObservationLog, read_active
+from manyeyes.maps.store.region_release import write_release
 from manyeyes.maps.store.releases import STORE_VERSION, Manifest, ReleaseStore, Watermark, read_json
-from manyeyes.maps.store.tiled_fusion import (
-    ALGORITHM,
-    FusionJob,
-    StepProgress,
-    TiledFusionConfig,
-    assemble_blocks,
-    fuse_and,
-)
+from manyeyes.maps.store.tiled_fusion import FusionJob, StepProgress, TiledFusionConfig, fuse_and
 
 
 class MapStore:
@@ -152,8 +146,7 @@ class MapStore:
                 watermark = _watermark_of(log.index.iterate_active())
 
                 def write(blocks: tuple[str, ...], watermark: Watermark = watermark) -> Manifest:
-                    part = _Release(job, self.published, blocks, watermark)
-                    return map_blocks(_write_release, [part], session)[0]
+                    return write_release(job, self.published, blocks, watermark, session, progress)
 
                 try:
                     manifest = fuse_and(write, job, log.index, tile_config, session, progress)
@@ -183,22 +176,6 @@ class MapStore:
         """Delete objects of tiles and deltas that no release names, as a killed writer leaves them; their keys."""
         with self.open_for_writing():
             return self.published.collect_garbage()
-
-
-@dataclass(frozen=True, eq=False)
-class _Release:
-    """What a worker needs to write a release: the linked stations of all blocks (keys of the job's work), and their watermark."""
-
-    job: FusionJob
-    published: ReleaseStore
-    blocks: tuple[str, ...]
-    watermark: Watermark
-
-
-def _write_release(part: _Release) -> Manifest:
-    """Stitch the links of all blocks, assemble the map and write the tiles."""
-    fused = assemble_blocks(part.job, part.blocks, part.published.frame)
-    return part.published.write(fused, ALGORITHM, repr(part.job.config), part.watermark)
 
 
 def _find_rows(active: ActiveObservations, watermark: Watermark) -> NDArray[np.int64] | None:

@@ -4,8 +4,8 @@
 The ground is divided into blocks of tiles. A block aligns its home observations, given all that their lines can meet: a coarse
 search, then sums of pairs, of which the poses are solved domain by domain (:mod:`manyeyes.maps.fusion.pose_optimization`). Last it
 builds the stations of its area from all observations that reach into it. Stations are linked in blocks that the configuration of
-the fusion fixes (:mod:`manyeyes.maps.fusion.block_linking`), each from the stations within its halo. One worker stitches the links
-at borders and assembles the map, so that no line is cut there.
+the fusion fixes (:mod:`manyeyes.maps.fusion.block_linking`), each from the stations within its halo. From their links the map is
+assembled and published region by region (:mod:`manyeyes.maps.store.region_release`).
 
 Every step is a pure function of objects in a store: a worker reads them, and writes its result to the store under a name that holds
 a hash of what it was made from and one of its content. So poses pass between neighbours alone, and this process holds the names
@@ -28,11 +28,9 @@ from numpy.typing import NDArray
 from manyeyes._records import pack_record, unpack_record
 from manyeyes._source import source_digest
 from manyeyes.datatypes import ConfigError
-from manyeyes.maps.elements.observation import MapFrame
-from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.fusion.agent_weights import AgentSums, AgentWeights, apply_agents
-from manyeyes.maps.fusion.block_linking import LinkedStations, find_block_area, link_block, list_blocks, stitch_blocks
-from manyeyes.maps.fusion.fuse import MapFusionConfig, assemble_linked
+from manyeyes.maps.fusion.block_linking import find_block_area, link_block, list_blocks
+from manyeyes.maps.fusion.fuse import MapFusionConfig
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays, to_observation_arrays
 from manyeyes.maps.fusion.pose_optimization import (
     find_domain_area,
@@ -172,26 +170,6 @@ class LostResultError(StoreError):
         self.key = key
 
 
-def fuse_tiles(
-    job: FusionJob,
-    index: LogIndex,
-    frame: MapFrame,
-    session: ExecutorSession,
-    tile_config: TiledFusionConfig = TiledFusionConfig(),
-    progress: StepProgress | None = None,
-) -> VectorMap:
-    """Fuse the observations of a log that count, and assemble the map in this process.
-
-    Raises:
-        FailedObservationsError: the fusion fails with some observations; without them it may succeed.
-    """
-
-    def assemble(blocks: Sequence[str]) -> VectorMap:
-        return assemble_blocks(job, blocks, frame)
-
-    return fuse_and(assemble, job, index, tile_config, session, progress)
-
-
 def fuse_and(
     use: Callable[[tuple[str, ...]], T],
     job: FusionJob,
@@ -217,13 +195,6 @@ def fuse_and(
                 ) from None
             lost.add(error.key)
             job.work.delete([error.key])
-
-
-def assemble_blocks(job: FusionJob, blocks: Sequence[str], frame: MapFrame) -> VectorMap:
-    """Assemble the map from the linked stations of all blocks; LostResultError where a result is missing or damaged."""
-    if not blocks:
-        return VectorMap.empty(frame)
-    return assemble_linked(stitch_blocks([_load(job, key, LinkedStations) for key in blocks]), job.config, frame)
 
 
 def iterate_blocks(index: LogIndex, tile_config: TiledFusionConfig) -> Iterator[TileBlock]:
@@ -253,7 +224,7 @@ def _make_plans(job: FusionJob, index: LogIndex, tile_config: TiledFusionConfig)
     plans = []
     for block in iterate_blocks(index, tile_config):
         folder = f"{WORK}/block/{block.place[0]}_{block.place[1]}"
-        (key,) = _put(job.work, folder, {"block": block}, "")
+        (key,) = put_results(job.work, folder, {"block": block}, "")
         home = np.isin(np.array(block.observations.ids), np.array(block.home_ids))
         xy, solver = block.observations.xy, job.config.pose_solver
         plans.append(
@@ -387,7 +358,7 @@ def _run_task(task: StepTask) -> FusionStepResult:
     results, failures = _compute(task)
     if failures:
         return FusionStepResult((), failures)
-    keys = _put(work, task.folder, results, task.digest)
+    keys = put_results(work, task.folder, results, task.digest)
     if task.kind == "stations":
         # Arrays are large and cheap to make again.
         work.delete(work.list(_arrays_folder(task.place)))
@@ -397,17 +368,17 @@ def _run_task(task: StepTask) -> FusionStepResult:
 def _compute(task: StepTask) -> tuple[dict[str, object], tuple[FailedObservation, ...]]:
     """Compute the results of a step, by name in order, or find the observations with which it fails."""
     job, solver = task.job, task.job.config.pose_solver
-    table = _load(job, task.agents, AgentWeights) if task.agents else None
+    table = load_result(job, task.agents, AgentWeights) if task.agents else None
     if task.kind == "restart":
         assert table is not None
         return {"agents": table.restart()}, ()
     if task.kind in ("sums", "weigh"):
-        sums = AgentSums.merge([_load(job, key, AgentSums) for key in task.inputs])
+        sums = AgentSums.merge([load_result(job, key, AgentSums) for key in task.inputs])
         if task.kind == "sums":
             return {"sums": sums}, ()
         return {"agents": weigh_agents(sums, table, solver.schedule[task.number], solver)}, ()
     if task.kind == "settle":
-        parts = [_load(job, key, PoseSolution) for key in task.inputs]
+        parts = [load_result(job, key, PoseSolution) for key in task.inputs]
         return {"poses": settle_domain(parts, task.place, solver)}, ()
     if task.kind == "solve":
         return _compute_solve(task)
@@ -423,7 +394,7 @@ def _compute(task: StepTask) -> tuple[dict[str, object], tuple[FailedObservation
 def _compute_solve(task: StepTask) -> tuple[dict[str, object], tuple[FailedObservation, ...]]:
     """Solve a domain, without the observations with which that fails."""
     solver = task.job.config.pose_solver
-    whole = PoseSolution.cat([_load(task.job, key, PoseSolution) for key in task.inputs])
+    whole = PoseSolution.cat([load_result(task.job, key, PoseSolution) for key in task.inputs])
 
     def solve(rows: Sequence[int]) -> tuple[PoseSolution, AgentSums]:
         part = whole.take_with_pairs(np.array(rows, np.int64))
@@ -438,8 +409,8 @@ def _load_block(
     job: FusionJob, keys: Sequence[str], table: AgentWeights | None
 ) -> tuple[TileBlock, PoseSolution | None]:
     """Load a block and the poses of what it reads, if there are keys of them."""
-    poses = [_load(job, key, PoseSolution) for key in keys[1:]]
-    return _load(job, keys[0], TileBlock), apply_agents(PoseSolution.cat(poses), table) if poses else None
+    poses = [load_result(job, key, PoseSolution) for key in keys[1:]]
+    return load_result(job, keys[0], TileBlock), apply_agents(PoseSolution.cat(poses), table) if poses else None
 
 
 def _compute_link(task: StepTask) -> tuple[dict[str, object], tuple[FailedObservation, ...]]:
@@ -450,7 +421,7 @@ def _compute_link(task: StepTask) -> tuple[dict[str, object], tuple[FailedObserv
         return {"links": link_block(StationTable.cat(tables), task.place, config.link, config.parallel_extension)}
 
     area, halo = find_block_area(task.place, config.link), config.link.block_halo_m
-    tables = [_load(task.job, key, StationTable).take_area(area, halo) for key in task.inputs]
+    tables = [load_result(task.job, key, StationTable).take_area(area, halo) for key in task.inputs]
     try:
         return link(tables), ()
     except CONTENT_ERRORS:
@@ -464,7 +435,7 @@ def _isolate_link(
     config = task.job.config
     origins = []
     for agents, *keys in task.origins:
-        block, solution = _load_block(task.job, keys, _load(task.job, agents, AgentWeights) if agents else None)
+        block, solution = _load_block(task.job, keys, load_result(task.job, agents, AgentWeights) if agents else None)
         stored = read_active(task.job.log, block.observations, np.arange(len(block.observations)))
         origins.append((block, solution, stored))
     ids = sorted({o.id for _, _, stored in origins for o in stored})
@@ -544,7 +515,7 @@ def _arrays_folder(place: Place) -> str:
     return f"{WORK}/arrays/{place[0]}_{place[1]}"
 
 
-def _put(work: ObjectStore, folder: str, results: dict[str, Any], made_from: str) -> tuple[str, ...]:
+def put_results(work: ObjectStore, folder: str, results: dict[str, Any], made_from: str) -> tuple[str, ...]:
     """Store results by name, each under a key that ends with a hash of its content; they take the place of what was there."""
     before, keys = set(work.list(folder)), []
     for name, value in results.items():
@@ -556,7 +527,7 @@ def _put(work: ObjectStore, folder: str, results: dict[str, Any], made_from: str
     return tuple(keys)
 
 
-def _load(job: FusionJob, key: str, kind: type[T]) -> T:
+def load_result(job: FusionJob, key: str, kind: type[T]) -> T:
     """Load a result of a step; LostResultError where it is missing or damaged."""
     try:
         data = job.work.get(key)
