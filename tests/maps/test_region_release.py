@@ -14,6 +14,7 @@ from manyeyes.maps.fusion.fuse import MapFusionConfig, fuse
 from manyeyes.maps.fusion.polyline_linking import LinkConfig
 from manyeyes.maps.store import region_assembly
 from manyeyes.maps.store.executors import InlineExecutor
+from manyeyes.maps.store.object_store import StoreError
 from manyeyes.maps.store.store import MapStore
 from manyeyes.maps.store.tiled_fusion import ALGORITHM, TiledFusionConfig
 from manyeyes.simulator.fleet import load_place, simulate_crowd
@@ -108,3 +109,17 @@ def test_sums_of_parts_are_that_of_the_whole(two_lanes):
     assert ContentSum.of(whole.take(np.arange(len(whole) - 1))).hexdigest() != whole.quantised_hash()
     twice = VectorMap.cat([two_lanes(), two_lanes()])
     assert twice.quantised_hash() != two_lanes().quantised_hash()
+
+
+def test_an_area_that_cannot_be_assembled_is_named_and_nothing_is_published(crowd, tmp_path, monkeypatch):
+    store = make_store(tmp_path, crowd)
+
+    def fail(*_: object) -> None:
+        raise np.linalg.LinAlgError("singular")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(region_assembly, "assemble_elements", fail)
+        with pytest.raises(StoreError, match=r"area \(-1024, -1024, 0, 0\) m, but .*LinAlgError: singular.*retract"):
+            store.fuse(CONFIG, TILES, InlineExecutor())
+    assert store.releases() == ()
+    assert store.fuse(CONFIG, TILES, InlineExecutor()).number == 1

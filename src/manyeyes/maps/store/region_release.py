@@ -17,8 +17,10 @@ from manyeyes.maps.elements.observation import MapFrame
 from manyeyes.maps.elements.vector_map import RETIRED, VectorMap
 from manyeyes.maps.fusion.block_linking import LinkedStations, find_block_area, list_blocks
 from manyeyes.maps.fusion.fuse import relate_elements
+from manyeyes.maps.isolation import CONTENT_ERRORS, describe_error
 from manyeyes.maps.store.executors import ExecutorSession
 from manyeyes.maps.store.map_diff import compute_home_tiles, transfer_ids
+from manyeyes.maps.store.object_store import StoreError
 from manyeyes.maps.store.region_assembly import (
     RING_REACH_M,
     Bounds,
@@ -268,7 +270,14 @@ def _assemble(task: RegionTask) -> StoredRegion | None:
             key = table[0].find(block)
         return None if key is None else load_result(job, key, LinkedStations)
 
-    found = assemble_region(task.region, load, config, task.job.published.frame)
+    try:
+        found = assemble_region(task.region, load, config, task.job.published.frame)
+    except CONTENT_ERRORS as error:
+        area = ", ".join(f"{side:g}" for side in find_region_area(task.region))
+        raise StoreError(
+            f"{job.work.location}: expected lines in the area ({area}) m, but {describe_error(error)} Report it with this line, or "
+            "retract the observations of that area."
+        ) from error
     if not len(found.elements):
         return None
     (key,) = put_results(job.work, f"{WORK}/region/{task.name}", {"elements": found}, "")
