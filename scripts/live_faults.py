@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from manyeyes.runtime.clock import LiveClock
+from manyeyes.viz.study_table import StudyTable
 
 MAX_AGE_NS, FLOOD_PER_S, MB = 500_000_000, 20_000, 1 << 20
 
@@ -238,8 +239,10 @@ def main(options: Options) -> None:
     print(
         f"{options.agents} processes, {options.transport}, rate {options.rate:g}; load of the machine before: {load:.1f}"
     )
-    rows = {"load_before": load, "rate": options.rate, "rows": [asdict(one) for one in outcomes]}
-    write_result(rows, options.out)
+    rows = {"load_before": load, "rows": [asdict(one) for one in outcomes]}
+    lines = tuple((one.fault, one.bar, one.result, "met" if one.passed else "not met") for one in outcomes)
+    title = f"Faults of {options.agents} processes, {options.transport}, clocks at rate {options.rate:g}"
+    write_result(rows, StudyTable(title, ("fault", "bar", "result", ""), lines), options)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ from live_team import PLACE, Tick, free_port, quantiles_ms, start_team, summaris
 from manyeyes.comms.network.interface import Network
 from manyeyes.runtime.transports.udp import UdpConfig, UdpNetwork
 from manyeyes.runtime.transports.zenoh import ZenohConfig, ZenohNetwork
+from manyeyes.viz.study_table import StudyTable
 
 
 @dataclass(frozen=True)
@@ -108,7 +109,17 @@ def main(options: Options) -> None:
         "packets": len(through),
     }
     print(json.dumps(result, indent=2))
-    write_result(result, options.out)
+    boxes, ages, transport, raw = (result[name] for name in ("boxes_ms", "age_ms", "transport_ms", "raw_datagrams_ms"))
+    lines = (
+        ("deadlines missed", f"{result['missed_fraction']:.2%} of {result['frames']}", "at most 1 %"),
+        ("overload level 0", f"{result['level_0_fraction']:.2%}", "at least 95 %"),
+        ("boxes after the sweep, p50 / p95", f"{boxes['p50']:.0f} / {boxes['p95']:.0f} ms", "p95 at most 100 ms"),
+        ("age of what is fused, p50 / p95", f"{ages['p50']:.0f} / {ages['p95']:.0f} ms", ""),
+        ("transport, p50 / p95", f"{transport['p50']:.2f} / {transport['p95']:.2f} ms", ""),
+        ("raw datagrams in turn, p50 / p95", f"{raw['p50']:.2f} / {raw['p95']:.2f} ms", ""),
+    )
+    title = f"Two agents at 10 Hz, {options.minutes:g} min, {options.transport}, {options.weights or 'a detector of one car'}"
+    write_result(result, StudyTable(title, ("quantity", "value", "bar"), lines), options)
 
 
 if __name__ == "__main__":

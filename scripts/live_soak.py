@@ -20,6 +20,8 @@ import tyro
 from live_team import Team, Tick, rss_bytes, start_team, summarise, write_result
 from numpy.typing import NDArray
 
+from manyeyes.viz.study_table import StudyTable
+
 MB, SAMPLE_S, BLOCK_S, NUM_DRAWS, MAX_POINTS = 1 << 20, 5.0, 60.0, 500, 400
 
 
@@ -148,7 +150,17 @@ def main(options: Options) -> None:
         "files": [min(tick.num_files for tick in late), max(tick.num_files for tick in late)],
     }
     print(json.dumps(result, indent=2))
-    write_result(result, options.out)
+    files, threads = "{} to {}".format(*result["files"]), ", ".join(map(str, result["threads"]))
+    lines = tuple(
+        (name, f"{slope.mb_per_h:.2f} [{slope.low:.2f}, {slope.high:.2f}]", str(result["rss_mb_last"][name]))
+        for name, slope in slopes.items()
+    )
+    title = (
+        f"{options.minutes:g} min, {options.agents} agents, {departures} departures, {result['frames']} frames, "
+        f"{result['missed_fraction']:.2%} of deadlines missed, threads {threads}, files {files}"
+    )
+    headings = ("agent", "memory [MB/h]; bar: upper end at most 2", "memory at the end [MB]")
+    write_result(result, StudyTable(title, headings, lines), options, options.seed)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ cores; ``weights`` takes a real one, on the frames of a recording.
 from __future__ import annotations
 
 import contextlib
-import json
 import multiprocessing
 import os
 import signal
@@ -37,6 +36,8 @@ from manyeyes.runtime.summary import Quantiles
 from manyeyes.runtime.transports.faulty import FaultPlan, FaultyNetwork
 from manyeyes.runtime.transports.udp import UdpConfig, UdpNetwork
 from manyeyes.runtime.transports.zenoh import ZenohConfig, ZenohNetwork
+from manyeyes.studies.provenance import write_json
+from manyeyes.viz.study_table import StudyTable
 
 FRAME_NS, PLACE = 100_000_000, (100.0, 100.0)
 
@@ -308,10 +309,10 @@ def summarise(ticks: Sequence[Tick]) -> dict[str, Any]:
     }
 
 
-def write_result(result: dict[str, Any], out: Path | None) -> None:
-    """Write a result as JSON, where a file is given."""
-    if out is not None:
-        out.write_text(json.dumps(result, indent=2) + "\n")
+def write_result(result: dict[str, Any], table: StudyTable, options: Any, seed: int = 0) -> None:
+    """Write a result and its table for documents as JSON, where the options name a file."""
+    if options.out is not None:
+        write_json(options.out, {"study": table.title, **result, "tables": [table]}, {"options": options}, seed)
 
 
 def rss_bytes(process: Any) -> tuple[int, int]:
