@@ -28,6 +28,7 @@ from manyeyes.runtime.keys import Identity, Issuer, Validity, generate_key, publ
 from manyeyes.runtime.signing import PacketSigner
 from manyeyes.runtime.trust_file import Anchor, Trust
 from manyeyes.studies.provenance import write_json
+from manyeyes.viz.study_table import StudyTable
 
 NOW_NS, NUM_MESSAGES, PACKETS_PER_S = 1_800_000_000 * 10**9, 20, 300
 
@@ -48,6 +49,23 @@ class Result:
 def make_message(time_ns: int, agent_id: int = 1) -> list[bytes]:
     boxes = Boxes.of(torch.zeros(250, 3), torch.ones(250, 3), torch.zeros(250))
     return encode(Message(agent_id, time_ns, Transform.identity(), torch.eye(3), objects=boxes), mtu=1_322)
+
+
+def make_table(result: Result) -> StudyTable:
+    """Tabulate the result beside its bars."""
+    lines = (
+        ("to sign a packet", f"{result.sign_us:.1f} us", ""),
+        ("to receive an unsigned packet", f"{result.receive_unsigned_us:.1f} us", ""),
+        ("to receive a signed packet", f"{result.receive_signed_us:.1f} us", ""),
+        ("to refuse a packet of a flood", f"{result.refused_us:.1f} us", ""),
+        (
+            "fraction of a core, 30 packets signed and 300 verified a second",
+            f"{result.core_fraction:.1%}",
+            "at most 5 %",
+        ),
+        ("envelope in a message of 4,096 bytes", f"{result.envelope_fraction_of_4096:.1%}", "at most 6 %"),
+    )
+    return StudyTable("Processor time and bytes of signatures", ("quantity", "value", "bar"), lines)
 
 
 def main() -> None:
@@ -106,7 +124,8 @@ def main() -> None:
         round(seconds, 4),
         round(3 * ENVELOPE_BYTES / 4096, 4),
     )
-    write_json(arguments.out, result, vars(arguments) | {"out": str(arguments.out.name)}, None)
+    content = {"study": "signatures", **asdict(result), "tables": [make_table(result)]}
+    write_json(arguments.out, content, vars(arguments) | {"out": str(arguments.out.name)}, None)
     for name, value in asdict(result).items():
         print(f"{name:28}{value:10}")
 

@@ -68,8 +68,8 @@ def missed_fraction(ticks: list[Tick]) -> float:
 
 
 def max_age_ms(ticks: list[Tick]) -> float:
-    """Return the largest age of fused messages, ms."""
-    return max((age for tick in ticks for age in tick.ages_ns), default=0) / 1e6
+    """Return the largest age of messages when they were fused, ms."""
+    return max((age for tick in ticks for age in tick.fused_ages_ns), default=0) / 1e6
 
 
 def kill_and_restart(team: Team, options: Options) -> Outcome:
@@ -173,7 +173,10 @@ def stopped_ego(team: Team, options: Options) -> Outcome:
     back = team.collect(1.5)[ego]
     complete = bool(back) and len(back[-1].fused) == team.config.num_agents - 1
     age_ms = max_age_ms(back + others)
+    # It may stop while it computes boxes, which then come late, and are marked as missed.
+    latest_ms = max((tick.latency_ns for tick in back), default=0) / 1e6
     text = f"all fused {complete}, age <= {age_ms:.0f} ms, others missed {missed_fraction(others):.1%}"
+    text += f", its latest boxes {latest_ms:.0f} ms after their sweep"
     return Outcome("SIGSTOP 5 s", "age <= 500 ms; recovery <= 1 s", text, complete and age_ms <= 500)
 
 

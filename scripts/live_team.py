@@ -60,7 +60,8 @@ class TeamConfig:
 class Tick:
     """What a process reports of a frame.
 
-    time_s: monotonic, at its end; sent_s: when its packets were sent. dropped: refused packets so far, by reason.
+    time_s: monotonic, at its end; sent_s: when its packets were sent. ages_ns: of each fused message when the boxes were there,
+    fused_ages_ns: when it was fused. dropped: refused packets so far, by reason.
     """
 
     agent_id: int
@@ -68,6 +69,7 @@ class Tick:
     sent_s: float
     fused: frozenset[int]
     ages_ns: tuple[int, ...]
+    fused_ages_ns: tuple[int, ...]
     latency_ns: int
     missed: bool
     level: int
@@ -200,11 +202,12 @@ def _report(agent_id: int, tick: LiveTick, rate: float) -> Tick:
     sent_s = now_s - (tick.wait_ns + tick.perceive_ns) / 1e9 / rate
     dropped = {name: count for name, count in vars(tick.dropped).items() if count}
     fused = frozenset(one.message.agent_id for one in tick.perception.received)
+    fused_ages = tuple(age - tick.perceive_ns for age in tick.ages_ns)
     rejected = tuple(one.reason for one in tick.perception.rejected)
     files = len(list(Path("/proc/self/fd").iterdir())) if Path("/proc/self/fd").exists() else 0
     return Tick(
-        agent_id, now_s, sent_s, fused, tick.ages_ns, tick.latency_ns, tick.missed, tick.level, tick.note, rejected, dropped,
-        tick.received_packets, threading.active_count(), files,
+        agent_id, now_s, sent_s, fused, tick.ages_ns, fused_ages, tick.latency_ns, tick.missed, tick.level, tick.note, rejected,
+        dropped, tick.received_packets, threading.active_count(), files,
     )  # fmt: skip
 
 
