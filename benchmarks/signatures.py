@@ -125,7 +125,7 @@ def main() -> None:
         round(3 * ENVELOPE_BYTES / 4096, 4),
     )
     content = {"study": "signatures", **asdict(result), "tables": [make_table(result)]}
-    write_json(arguments.out, content, vars(arguments) | {"out": str(arguments.out.name)}, None)
+    write_json(arguments.out, content, vars(arguments) | {"out": str(arguments.out.name)}, 0)
     for name, value in asdict(result).items():
         print(f"{name:28}{value:10}")
 

@@ -102,7 +102,9 @@ def _find_split(origin: dict[str, Any], result: dict[str, Any]) -> str:
     if "cases" in result:
         # Recordings are named by the command; each case is one of them.
         return ", ".join(dict.fromkeys(case["case"] for case in result["cases"]))
-    return str(options.get("validation_split") or options.get("split") or result.get("split") or "")
+    # The live runtime plays a folder and a split.
+    played = options.get("recording") or ("", "")
+    return str(options.get("validation_split") or options.get("split") or result.get("split") or played[1])
 
 
 def _is_speed(result: dict[str, Any]) -> bool:
@@ -116,10 +118,11 @@ def _has_no_recording(result: dict[str, Any]) -> bool:
 
 
 def _has_simulated_scenes(result: dict[str, Any]) -> bool:
-    """Return whether a result is of the step, of the cost of maps or of a study of drives or map fusion, which simulate what they
-    need.
+    """Return whether a result is of the step, of the cost of maps, of the live runtime or of a study of drives or map fusion, which
+    simulate what they need.
     """
-    simulates = "summaries" in result or result.get("study") in ("malicious-agents", "false-accusations")
+    simulates = "summaries" in result or result.get("study") in ("malicious-agents", "false-accusations", "signatures")
+    simulates |= "load_before" in result
     return simulates or "costs" in result or "present_stages_ms" in (result.get("rows") or [{}])[0]
 
 
