@@ -50,7 +50,7 @@ class _Rate:
 
 
 @dataclass
-class _Link:
+class _LinkSocket:
     receiver: socket.socket
     rate: _Rate
     last_s: float
@@ -62,7 +62,7 @@ class LinkSockets:
 
     port: int
     clock: Callable[[], float]
-    _links: dict[Sender, _Link] = field(default_factory=dict)
+    _links: dict[Sender, _LinkSocket] = field(default_factory=dict)
     _observed: OrderedDict[Sender, _Rate] = field(default_factory=OrderedDict)
     _refused_until_s: dict[Sender, float] = field(default_factory=dict)
 
@@ -103,7 +103,7 @@ class LinkSockets:
             return None
         now_s = self.clock()
         self._observed.pop(sender, None)
-        self._links[sender] = _Link(receiver, _Rate(now_s), now_s)
+        self._links[sender] = _LinkSocket(receiver, _Rate(now_s), now_s)
         return receiver
 
     def count(self, sender: Sender) -> None:
