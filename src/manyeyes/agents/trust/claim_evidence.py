@@ -58,7 +58,7 @@ class ClaimCheckConfig:
 
     @property
     def sources(self) -> tuple[float, float, float]:
-        """What tells senders that are one source: copy_m, max_copied, min_apart_m."""
+        """Limits by which two senders are one source: copy_m, max_copied, min_apart_m."""
         return self.copy_m, self.max_copied, self.min_apart_m
 
 
