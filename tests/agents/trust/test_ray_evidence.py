@@ -336,3 +336,44 @@ def test_a_message_that_is_assessed_again_adds_no_evidence(street, monkeypatch):
     street.index -= 1
     again = street.step({1: cars(FREE)})
     assert sender(again, 1).trust == pytest.approx(sender(first, 1).trust)
+
+
+def hidden_cars(num_cars: int, score: float) -> Boxes:
+    """Cars behind the wall, 0.3 m apart: the ego sees none of their places."""
+    return cars(*((30.0 + 0.3 * k, 15.0) for k in range(num_cars)), score=score)
+
+
+@pytest.mark.parametrize(("score", "limit"), [(0.9, 6), (0.6, 15)])
+def test_a_message_of_many_more_unconfirmed_than_confirmed_objects_is_not_fused(street, score, limit):
+    """Two confirmed ones allow one more."""
+    claims = {1: Boxes.cat([cars(SEEN, SEEN_TOO, score=score), hidden_cars(limit + 1, score)])}
+    assert sender(street.run(5, claims), 1).weight > 0.9
+    claims = {1: Boxes.cat([cars(SEEN, SEEN_TOO, score=score), hidden_cars(limit + 2, score)])}
+    found = street.step(claims)
+    assert sender(found, 1).weight == 0.0 and sender(found, 1).reason == "too many of its claims are unconfirmed"
+
+
+def test_unconfirmed_objects_change_no_trust_and_name_no_sender_and_its_content_returns(street):
+    trust = sender(street.run(10, {1: HONEST, 2: HONEST}), 1).trust
+    excess = {1: Boxes.cat([HONEST, hidden_cars(40, 0.9)]), 2: HONEST}
+    found = street.step(excess)
+    assert sender(found, 1).status is NORMAL and sender(found, 1).trust == pytest.approx(trust, abs=0.01)
+    assert sender(found, 2).weight == 1.0
+    weights = [sender(street.step({1: HONEST, 2: HONEST}), 1).weight for _ in range(5)]
+    assert weights == [0.0, 0.0, 0.0, 0.0, 1.0]
+
+
+def test_of_a_named_sender_with_an_excess_nothing_is_kept(street):
+    claims = {1: Boxes.cat([cars(SEEN, SEEN_TOO, FREE), hidden_cars(3, 0.9)])}
+    found = sender(street.run(3, claims), 1)
+    assert found.status is MALICIOUS and found.keeps_confirmed
+    found = sender(street.step({1: Boxes.cat([claims[1], hidden_cars(20, 0.9)])}), 1)
+    assert found.status is MALICIOUS and not found.keeps_confirmed
+
+
+def test_a_message_that_is_assessed_again_counts_once_among_the_last_five(street):
+    street.step({1: Boxes.cat([HONEST, hidden_cars(40, 0.9)])})
+    street.run(4, {1: HONEST})
+    street.index -= 1
+    assert sender(street.step({1: HONEST}), 1).weight == 0.0
+    assert sender(street.step({1: HONEST}), 1).weight > 0.9

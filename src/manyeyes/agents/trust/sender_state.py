@@ -31,8 +31,8 @@ class SenderMemory:
 
     reason: of its exclusion; empty if it is not excluded. keeps_confirmed: it was excluded for refuted claims; those that others
     confirm are still fused. contents: of its last messages; copies: which of them were copies, the newest first; contested: in
-    which of them a few senders alone claimed several objects that the ego refutes. contradicted_ns: when its stated pose was
-    last contradicted.
+    which of them a few senders alone claimed several objects that the ego refutes; excess: which of them had too many unconfirmed
+    claims. contradicted_ns: when its stated pose was last contradicted.
     """
 
     trust: BetaTrust
@@ -45,6 +45,7 @@ class SenderMemory:
     contents: tuple[StatedContent, ...] = ()
     copies: tuple[bool, ...] = ()
     contested: tuple[bool, ...] = ()
+    excess: tuple[bool, ...] = ()
     contradicted_ns: int = NEVER_NS
 
 

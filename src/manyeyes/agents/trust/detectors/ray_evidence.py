@@ -42,6 +42,7 @@ from manyeyes.agents.trust.sender_state import (
     advance,
     forget_oldest,
 )
+from manyeyes.agents.trust.unconfirmed import UnconfirmedConfig, has_excess
 from manyeyes.datatypes import Boxes, Message
 
 LOW_TRUST = "low trust"
@@ -90,7 +91,7 @@ class NamingConfig:
 @register_misbehaviour_detector("ray-evidence")
 @dataclass(frozen=True)
 class RayEvidenceDetector(MisbehaviourDetector):
-    """Evidence, trust, omissions, common offsets, copies, observers and naming, each with its constants."""
+    """Evidence, trust, omissions, common offsets, copies, excess, observers and naming, each with its constants."""
 
     evidence: ClaimCheckConfig = field(default_factory=ClaimCheckConfig)
     trust: TrustConfig = field(default_factory=TrustConfig)
@@ -98,6 +99,7 @@ class RayEvidenceDetector(MisbehaviourDetector):
     naming: NamingConfig = field(default_factory=NamingConfig)
     offset: OffsetConfig = field(default_factory=OffsetConfig)
     copies: CopyConfig = field(default_factory=CopyConfig)
+    unconfirmed: UnconfirmedConfig = field(default_factory=UnconfirmedConfig)
     observers: ObserverConfig = field(default_factory=ObserverConfig)
 
     def excluded(self, state: object | None, agent_ids: Collection[int], now_ns: int) -> frozenset[int]:
@@ -131,20 +133,21 @@ class RayEvidenceDetector(MisbehaviourDetector):
             for one, check in zip(checked, checks)
         ]
         num_claims = sum(len(check.xy) for check in checks)
+        claims = tuple(
+            AssessedClaims(one.claims, check.evidence, one.is_detected) for one, check in zip(checked, checks)
+        )
         senders, exclusions, assessments = dict(now.senders), now.exclusions, list[SenderAssessment]()
-        for message, check, omitted, is_omitting in zip(received.messages, counted, unclaimed, omits):
+        for message, check, omitted, is_omitting, assessed in zip(received.messages, counted, unclaimed, omits, claims):
             agent_id = message.agent_id
             is_faulty = agent_id in received.faulty or agent_id in found.contradicted
             fault = self.trust.omitted * is_omitting
             is_unused = is_faulty or agent_id in found.copied
             memory = self._update_sender(now, message, check, fault, is_unused, omitted, agent_id in contested)
+            memory = self._count_excess(memory, now, message, assessed)
             memory, exclusions = self._decide(agent_id, memory, exclusions, now, num_claims, is_faulty)
             senders[agent_id] = memory
             is_excluded = exclusions.contains(agent_id, now.now_ns)
             assessments.append(self._assess_sender(agent_id, memory, is_excluded, is_faulty, found))
-        claims = tuple(
-            AssessedClaims(one.claims, check.evidence, one.is_detected) for one, check in zip(checked, checks)
-        )
         return Assessment(
             tuple(assessments), claims, replace(now, senders=forget_oldest(senders), exclusions=exclusions)
         )
@@ -344,6 +347,16 @@ class RayEvidenceDetector(MisbehaviourDetector):
             contested=(is_contested, *memory.contested)[:NUM_MESSAGES],
         )
 
+    def _count_excess(
+        self, memory: SenderMemory, now: TrustState, message: Message, claims: AssessedClaims
+    ) -> SenderMemory:
+        """Return the memory of a sender with whether its message has an excess of unconfirmed claims."""
+        excess = memory.excess
+        if _memory(now, message.agent_id).captured_ns == message.timestamp_ns:
+            excess = excess[1:]
+        is_excess = has_excess(claims, self.unconfirmed)
+        return replace(memory, excess=(is_excess, *excess)[: self.unconfirmed.num_messages])
+
     def _find_reason(self, memory: SenderMemory, num_claims: int) -> str:
         """Return why a sender is named malicious, or nothing."""
         tracks = memory.tracks
@@ -364,7 +377,9 @@ class RayEvidenceDetector(MisbehaviourDetector):
     ) -> SenderAssessment:
         trust = memory.trust.mean
         if is_excluded:
-            keeps_confirmed = memory.keeps_confirmed and not is_faulty and agent_id not in found.unused
+            keeps_confirmed = memory.keeps_confirmed and not (
+                is_faulty or agent_id in found.unused or any(memory.excess)
+            )
             return SenderAssessment(agent_id, trust, 0.0, SenderStatus.MALICIOUS, memory.reason, keeps_confirmed)
         if agent_id in found.contradicted:
             reason = "its claims have a common offset to the ego's detections"
@@ -373,6 +388,9 @@ class RayEvidenceDetector(MisbehaviourDetector):
             return SenderAssessment(
                 agent_id, trust, 0.0, reason=f"its content is that of agent {found.copied[agent_id]}"
             )
+        if any(memory.excess):
+            reason = "too many of its claims are unconfirmed"
+            return SenderAssessment(agent_id, trust, 0.0, reason=reason)
         status = SenderStatus.FAULTY if is_faulty else SenderStatus.NORMAL
         reason = "its poses have an offset or a drift" if is_faulty else ""
         return SenderAssessment(agent_id, trust, fusion_weight(trust, self.trust), status, reason)

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages with far more unconfirmed objects than honest detectors state, of which nothing is fused.
+
+A single unconfirmed claim is no evidence, since agents see what others do not. Dozens of them in one message, each of a high score,
+are: an honest agent in the same place shares most of what it sees with the ego or with other senders.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from manyeyes.agents.trust.interface import AssessedClaims
+
+
+@dataclass(frozen=True)
+class UnconfirmedConfig:
+    """Numbers of unconfirmed claims of a message.
+
+    limits: pairs of a score and how many claims of at least that score may be unconfirmed; per_confirmed: how many more for each
+    confirmed one. num_messages: of a sender, in which one with more counts. Chosen on Town07, where honest messages of late fusion
+    have at most 4 of score 0.8 or more, and 16 of 0.5 or more in 99 of 100.
+    """
+
+    limits: Sequence[tuple[float, int]] = ((0.8, 6), (0.5, 15))
+    per_confirmed: float = 0.5
+    num_messages: int = 5
+
+
+def has_excess(claims: AssessedClaims, config: UnconfirmedConfig) -> bool:
+    """Return whether more claims of a message are unconfirmed than the limits allow."""
+    score, is_confirmed = claims.claims.score, claims.is_confirmed
+    for min_score, max_claims in config.limits:
+        is_likely = score >= min_score
+        num_confirmed = np.count_nonzero(is_likely & is_confirmed)
+        if np.count_nonzero(is_likely) - num_confirmed > max_claims + config.per_confirmed * num_confirmed:
+            return True
+    return False
