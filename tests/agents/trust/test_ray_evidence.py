@@ -343,7 +343,7 @@ def hidden_cars(num_cars: int, score: float) -> Boxes:
     return cars(*((30.0 + 0.3 * k, 15.0) for k in range(num_cars)), score=score)
 
 
-@pytest.mark.parametrize(("score", "limit"), [(0.9, 6), (0.6, 15)])
+@pytest.mark.parametrize(("score", "limit"), [(0.9, 6), (0.6, 20)])
 def test_a_message_of_many_more_unconfirmed_than_confirmed_objects_is_not_fused(street, score, limit):
     """Two confirmed ones allow one more."""
     claims = {1: Boxes.cat([cars(SEEN, SEEN_TOO, score=score), hidden_cars(limit + 1, score)])}
