@@ -377,3 +377,8 @@ def test_a_message_that_is_assessed_again_counts_once_among_the_last_five(street
     street.index -= 1
     assert sender(street.step({1: HONEST}), 1).weight == 0.0
     assert sender(street.step({1: HONEST}), 1).weight > 0.9
+
+
+def test_a_sender_with_wrong_poses_and_an_excess_stays_faulty(street):
+    found = sender(street.step({1: Boxes.cat([HONEST, hidden_cars(40, 0.9)])}, faulty=[1]), 1)
+    assert found.weight == 0.0 and found.status is SenderStatus.FAULTY

@@ -20,8 +20,8 @@ class UnconfirmedConfig:
     """Numbers of unconfirmed claims of a message.
 
     limits: pairs of a score and how many claims of at least that score may be unconfirmed; per_confirmed: how many more for each
-    confirmed one. num_messages: of a sender, in which one with more counts. Chosen on Town07 and the training towns,
-    where they concern none and 4 in 1,000 of the honest messages of late fusion.
+    confirmed one. num_messages: a sender is left out while one of its last so many messages exceeds a limit. Chosen on Town07 and
+    the training towns, where the limits concern none and 4 in 1,000 of the honest messages of late fusion.
     """
 
     limits: Sequence[tuple[float, int]] = ((0.8, 6), (0.5, 20))

@@ -91,7 +91,7 @@ class NamingConfig:
 @register_misbehaviour_detector("ray-evidence")
 @dataclass(frozen=True)
 class RayEvidenceDetector(MisbehaviourDetector):
-    """Evidence, trust, omissions, common offsets, copies, excess, observers and naming, each with its constants."""
+    """Evidence, trust, omissions, common offsets, copies, unconfirmed claims, observers and naming, each with its constants."""
 
     evidence: ClaimCheckConfig = field(default_factory=ClaimCheckConfig)
     trust: TrustConfig = field(default_factory=TrustConfig)
@@ -388,11 +388,10 @@ class RayEvidenceDetector(MisbehaviourDetector):
             return SenderAssessment(
                 agent_id, trust, 0.0, reason=f"its content is that of agent {found.copied[agent_id]}"
             )
-        if any(memory.excess):
-            reason = "too many of its claims are unconfirmed"
-            return SenderAssessment(agent_id, trust, 0.0, reason=reason)
         status = SenderStatus.FAULTY if is_faulty else SenderStatus.NORMAL
         reason = "its poses have an offset or a drift" if is_faulty else ""
+        if any(memory.excess):
+            return SenderAssessment(agent_id, trust, 0.0, status, reason or "too many of its claims are unconfirmed")
         return SenderAssessment(agent_id, trust, fusion_weight(trust, self.trust), status, reason)
 
 
