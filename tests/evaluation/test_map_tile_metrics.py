@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapElements
-from manyeyes.evaluation.maps.tile_metrics import TileTable
+from manyeyes.evaluation.maps.tile_metrics import TileTable, split_by_curvature
 from manyeyes.evaluation.maps.tile_prediction import ScenarioPredictions, TilePrediction
 
 LINES = [[[0.0, 12.0 * k], [30.0, 12.0 * k]] for k in range(4)]
@@ -59,3 +59,17 @@ def test_classes_without_ground_truth_are_not_averaged():
     table = TileTable([ScenarioPredictions("a", 0, (TilePrediction("row", lines, lines, ()),))])
     row = table.make_row("row")
     assert row.mean_ap[0].value == 1.0 and np.isnan(row.ap[0][0].value) and row.bytes_per_frame == 0.0
+
+
+def test_tiles_with_curved_dividers_are_split_from_straight_ones():
+    angle = np.linspace(0, 1, 50)
+    arc = MapElements.of([50.0 * np.stack((np.sin(angle), 1 - np.cos(angle)), 1)], DIVIDER)
+    predictions = (TilePrediction("row", arc, arc, ()), TilePrediction("row", TRUTH.take([0]), TRUTH, ()))
+    split = split_by_curvature([ScenarioPredictions("a", 0, predictions), ScenarioPredictions("b", 0, predictions[1:])])
+    assert {name: [(r.scenario, len(r.predictions)) for r in part] for name, part in split.items()} == {
+        "straight": [("a", 1), ("b", 1)],
+        "curved": [("a", 1)],
+    }
+    assert TileTable(split["curved"]).make_row("row").ap[1][1].value == 1.0
+    assert TileTable(split["straight"]).make_row("row").ap[1][1].value == pytest.approx(0.25)
+    assert list(split_by_curvature([ScenarioPredictions("b", 0, predictions[1:])])) == ["straight"]

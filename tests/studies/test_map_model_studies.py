@@ -162,7 +162,9 @@ def test_more_frames_against_one(weights, tmp_path, monkeypatch):
         rows["2"]["bytes_per_tile"] == 2000 and rows["2"]["num_tiles"] == 6 and len(rows["2"]["mean_ap_by_seed"]) == 2
     )
     assert get_differences(result)["LiDAR: 10 frames - one vehicle"] == pytest.approx(0.875)
-    assert text.count("not run") == 2, "cameras, and both"
+    (straight,) = result["curvature_rows"]["LiDAR"]
+    assert straight["name"] == "straight" and straight["mean_ap"][0]["value"] == 1.0, "no street is curved"
+    assert text.count("not run") == 4, "cameras, and both, in each table"
 
 
 def table(parts):

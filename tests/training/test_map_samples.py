@@ -6,11 +6,13 @@ import math
 
 import numpy as np
 import pytest
+import shapely
 import torch
 
 from manyeyes.datatypes import AgentFrame, BevGrid, ConfigError, PointCloud, Snapshot, Transform
 from manyeyes.datatypes.camera import Camera, CameraImage
 from manyeyes.datatypes.map_element import CROSSING, DIVIDER, KINDS, MapElements
+from manyeyes.evaluation.maps.curvature import measure_curved_length
 from manyeyes.models.maps.bev import BevConfig
 from manyeyes.models.maps.head import MapHeadConfig
 from manyeyes.models.maps.map_model import MapModelConfig
@@ -71,7 +73,9 @@ AUGMENTS = {
     "none": EXACT,
     "turn": dataclasses.replace(EXACT, max_yaw_rad=0.5),
     "shift": dataclasses.replace(EXACT, max_shift_m=4.0),
-    "all": MapAugmentConfig(1, 6, 0.5, 4.0, flip=True),
+    "bend": dataclasses.replace(EXACT, max_yaw_rad=0.5, bend_probability=1.0, max_curvature=0.03),
+    "curved": dataclasses.replace(EXACT, curved_candidates=4),
+    "all": MapAugmentConfig(1, 6, 0.5, 4.0, flip=True, bend_probability=0.5, curved_candidates=3),
 }
 
 
@@ -80,17 +84,36 @@ def test_points_truth_and_line_mask_agree(name):
     for number in range(12):
         sample = stream(AUGMENTS[name]).draw(number)
         line = next(sample.truth.polyline(i) for i in range(len(sample.truth)) if sample.truth.kind[i] == DIVIDER)
-        along = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
+        # Between vertices 2 m apart, a bent line is off by at most 15 mm.
+        tolerance = 0.016 if AUGMENTS[name].bend_probability else 1e-4
         for k, frame in enumerate(sample.frames):
             # Every point of the cloud lies on the painted line, in the tile and in the ink of the look.
-            there = sample.tile_from_agent[k].apply(frame.points.xyz.double())[:, :2].numpy() - line[0]
-            np.testing.assert_allclose(there[:, 0] * along[1] - there[:, 1] * along[0], 0, atol=1e-4)
+            there = sample.tile_from_agent[k].apply(frame.points.xyz.double())[:, :2].numpy()
+            inside = np.hypot(*(there - line.mean(0)).T) < 8
+            assert inside.any()
+            distances = shapely.distance(shapely.points(there[inside]), shapely.LineString(line))
+            np.testing.assert_allclose(distances, 0, atol=tolerance)
             near = frame.points.xyz[CONFIG.bev.grid.contains(frame.points.xyz[:, :2]), :2]
             # A cell's border may fall either way: some point within half a step is on an inked cell.
             yx = CONFIG.bev.token_grid.cells(near)
             ink = torch.nn.functional.max_pool2d(sample.line_mask[k, :1].float(), 3, 1, 1)[0]
             assert len(near) and bool((ink[yx[:, 0], yx[:, 1]] > 0).all())
             assert 0.005 < float(sample.line_mask[k, 0].float().mean()) < 0.1
+
+
+def test_bent_tiles_are_curved_and_others_of_straight_streets_are_not():
+    bent, straight = ([stream(AUGMENTS[n]).draw(k).truth for k in range(12)] for n in ("bend", "none"))
+    assert not any(measure_curved_length(truth) for truth in straight)
+    curved = [measure_curved_length(truth) for truth in bent]
+    assert sum(length > 5 for length in curved) >= 6
+    # Bent to both sides: the middle of a line lies left or right of its chord.
+    sides = {np.sign(_middle_offset(truth.polyline(0))) for truth in bent if truth.kind[0] == DIVIDER}
+    assert sides == {-1.0, 1.0}
+
+
+def _middle_offset(line):
+    chord, middle = line[-1] - line[0], line[len(line) // 2] - line[0]
+    return chord[0] * middle[1] - chord[1] * middle[0]
 
 
 def test_samples_are_keyed_and_have_several_frames():

@@ -8,10 +8,11 @@ over scenarios, each with all its seeds; scenarios of one town share streets, so
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from manyeyes.evaluation.maps.curvature import is_curved
 from manyeyes.evaluation.maps.metrics import PAPER_KINDS
 from manyeyes.evaluation.maps.pooled_ap import (
     MapPair,
@@ -101,6 +102,20 @@ class TileTable:
             for one in result.predictions
             if one.row_name == name and seed in (None, result.seed)
         ]
+
+
+def split_by_curvature(results: Sequence[ScenarioPredictions]) -> dict[str, list[ScenarioPredictions]]:
+    """Return the predictions of tiles with straight and with curved dividers apart; a side without any is left out."""
+    sides = {"straight": False, "curved": True}
+    split = {
+        name: [
+            replace(result, predictions=kept)
+            for result in results
+            if (kept := tuple(one for one in result.predictions if is_curved(one.truth) is side))
+        ]
+        for name, side in sides.items()
+    }
+    return {name: part for name, part in split.items() if part}
 
 
 def _make_map_pair(scenario: str, prediction: TilePrediction) -> MapPair:

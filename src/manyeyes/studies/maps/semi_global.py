@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
-from manyeyes.evaluation.maps.tile_metrics import TileTable
+from dataclasses import replace
+
+from manyeyes.evaluation.maps.tile_metrics import TileRow, TileTable, split_by_curvature
 from manyeyes.evaluation.maps.tile_prediction import SemiGlobalPredictor
 from manyeyes.evaluation.statistics.comparison import Comparison
 from manyeyes.studies.engine.report import StudyContext
@@ -26,8 +28,10 @@ def run(options: MapModelOptions, context: StudyContext) -> None:
     names = tuple(map(str, predictor.frame_counts))
     rows = {sensors: [table.make_row(name) for name in names] for sensors, table in tile_tables.items()}
     comparisons = [c for sensors, table in tile_tables.items() for c in make_comparisons(sensors, table, names)]
+    by_curvature = {sensors: make_curvature_rows(table, names[-1]) for sensors, table in tile_tables.items()}
     tables = [
         make_rows_table("Tiles, by sensors and frames", rows),
+        make_rows_table(f"Tiles of {names[-1]} frames, by the curvature of their dividers", by_curvature),
         make_comparison_table(comparisons),
         PAPER_TABLE,
     ]
@@ -38,7 +42,15 @@ def run(options: MapModelOptions, context: StudyContext) -> None:
         for result in select_for_figure(results, lambda c: len(c.predictions[0].truth))
         for panel in make_tile_panels(result, titles, TILE_AREA)
     ]
-    study.write_report({"rows": rows, "comparisons": comparisons}, tables, panels, 3)
+    payload = {"rows": rows, "curvature_rows": by_curvature, "comparisons": comparisons}
+    study.write_report(payload, tables, panels, 3)
+
+
+def make_curvature_rows(table: TileTable, name: str) -> list[TileRow]:
+    """Return the row of a name for tiles with straight and with curved dividers (``evaluation.maps.curvature``) apart."""
+    return [
+        replace(TileTable(part).make_row(name), name=side) for side, part in split_by_curvature(table.results).items()
+    ]
 
 
 def make_comparisons(sensors: str, table: TileTable, names: tuple[str, ...]) -> list[Comparison]:

@@ -22,10 +22,12 @@ from manyeyes.datasets.base import Recording
 from manyeyes.datasets.frame_reader import FrameReader, as_frame_reader
 from manyeyes.datatypes import AgentFrame, BevGrid, Camera, CameraImage, Transform
 from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements
-from manyeyes.evaluation.maps.tiles import check_town_split, crop_to_tile, find_town
+from manyeyes.evaluation.maps.curvature import measure_curved_length
+from manyeyes.evaluation.maps.tiles import check_town_split, crop_to_tile, find_town, to_xy_yaw
 from manyeyes.models.maps.map_model import FRAMES_PER_TILE, MapModelConfig
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.polyline import resample_spaced
+from manyeyes.training.maps.bending import REACH_M, Bend, find_near_elements, has_images
 from manyeyes.training.mirroring import mirror_factors, resize_cloud, resize_transform
 
 Floats = NDArray[np.float64]
@@ -73,6 +75,10 @@ class MapAugmentConfig:
         sigma_xy_m: position error of reported poses.
         sigma_yaw_rad: heading error of reported poses.
         flip: mirror left to right with probability 0.5.
+        bend_probability: of bending the tile; frames with images are not bent.
+        max_curvature: of a bent tile, 1/m; it is uniform to both sides.
+        curved_candidates: number of places that are drawn for a tile, of which the one with most curved dividers is taken, in
+            half of the tiles; 1 takes the first.
     """
 
     min_frames: int = 1
@@ -82,6 +88,9 @@ class MapAugmentConfig:
     sigma_xy_m: float = 0.0
     sigma_yaw_rad: float = 0.0
     flip: bool = True
+    bend_probability: float = 0.0
+    max_curvature: float = 1 / 50
+    curved_candidates: int = 1
 
 
 @dataclass(frozen=True)
@@ -123,7 +132,18 @@ class TileStream:
     def draw(self, number: int) -> MapSample:
         """Draw a tile around a uniform scenario, frame and agent, and frames of it, roadside units first."""
         rng, augment = keyed_generator("tile", self.seed, number), self.augment
-        scenarios = self.recording.scenarios
+        places = [self._draw_place(rng)]
+        if augment.curved_candidates > 1 and rng.random() < 0.5:
+            places += [self._draw_place(rng) for _ in range(augment.curved_candidates - 1)]
+        scenario, own, world_from_tile = max(places, key=self._measure_curves) if len(places) > 1 else places[0]
+        num_frames = int(rng.integers(augment.min_frames, augment.max_frames + 1))
+        middle = world_from_tile.translation[:2].numpy()
+        frames = [own, *self._sample_frames(scenario, middle, num_frames - 1, rng)]
+        return self._sample(scenario, world_from_tile, frames, rng)
+
+    def _draw_place(self, rng: np.random.Generator) -> tuple[str, AgentFrame, Transform]:
+        """Draw a scenario, a frame of an agent, and a tile around it (world_from_tile)."""
+        augment, scenarios = self.augment, self.recording.scenarios
         scenario = scenarios[int(rng.integers(len(scenarios)))]
         index = int(rng.integers(self.recording.length(scenario)))
         present = self._frames.present_agents(scenario, index)
@@ -131,10 +151,13 @@ class TileStream:
         turn = float(own.world_from_agent.yaw) + augment.max_yaw_rad * rng.uniform(-1, 1)
         shift = augment.max_shift_m * rng.uniform(-1, 1, 2)
         middle = own.world_from_agent.translation[:2].numpy() + shift
-        world_from_tile = Transform.from_xyz_yaw(float(middle[0]), float(middle[1]), 0.0, turn)
-        num_frames = int(rng.integers(augment.min_frames, augment.max_frames + 1))
-        frames = [own, *self._sample_frames(scenario, middle, num_frames - 1, rng)]
-        return self._sample(scenario, world_from_tile, frames, rng)
+        return scenario, own, Transform.from_xyz_yaw(float(middle[0]), float(middle[1]), 0.0, turn)
+
+    def _measure_curves(self, place: tuple[str, AgentFrame, Transform]) -> float:
+        scenario, _, world_from_tile = place
+        return measure_curved_length(
+            crop_to_tile(self.maps[self._town(scenario)], world_from_tile, self.map_model.tile)
+        )
 
     def _sample_frames(self, scenario: str, middle: Floats, count: int, rng: np.random.Generator) -> list[AgentFrame]:
         """Draw frames of nearby agents, each at its own instant; one of a roadside unit first, where there is one."""
@@ -164,6 +187,12 @@ class TileStream:
         augment, config = self.augment, self.map_model
         world = self.maps[self._town(scenario)]
         tile_from_world = world_from_tile.inverse()
+        if augment.bend_probability > 0 and not has_images(frames) and rng.random() < augment.bend_probability:
+            bend = Bend(float(augment.max_curvature * rng.uniform(0.1, 1) * rng.choice((-1.0, 1.0))))
+            near = find_near_elements(world.transform(*to_xy_yaw(tile_from_world)), 3 * REACH_M)
+            world, world_from_tile = bend.bend_elements(near), Transform.identity()
+            frames = [bend.bend_frame(frame, tile_from_world @ frame.world_from_agent) for frame in frames]
+            tile_from_world = world_from_tile
         reported, local_elements = [], []
         for frame in frames:
             dx, dy, turn = rng.normal(size=3) * [augment.sigma_xy_m, augment.sigma_xy_m, augment.sigma_yaw_rad]
