@@ -7,6 +7,7 @@ Garbage is not collected meanwhile, and loops run where no folder can be written
 from __future__ import annotations
 
 import gc
+import json
 import multiprocessing
 import pickle
 import re
@@ -24,6 +25,7 @@ from numba.core import caching, event
 
 import manyeyes
 from manyeyes._jit import (
+    _describe,
     _LinkedCompiler,
     _LockedIndexFile,
     add_row,
@@ -32,6 +34,77 @@ from manyeyes._jit import (
     set_row,
     set_rows,
 )
+
+_BLOCK = """
+        for i in range(x.shape[0]):
+            for j in range(i, x.shape[0]):
+                if (i + j) % {k} == 1:
+                    total += factor * x[i] * x[j]
+                else:
+                    total -= x[j]
+"""
+# Too long a closure for LLVM to copy it into its callers.
+_CLOSURES = f"""
+from manyeyes._jit import njit
+
+def make(factor):
+    @njit(cache=True)
+    def add(x):
+        total = 0.0
+{"".join(_BLOCK.format(k=k) for k in range(3, 23))}
+        return total
+    return add
+
+one, two = make(1.0), make(2.0)
+
+@njit(cache=True)
+def sum_once(x):
+    return one(x) + one(x[1:]) + one(x[2:])
+
+@njit(cache=True)
+def sum_twice(x):
+    return two(x) + two(x[1:]) + two(x[2:])
+"""
+
+
+@pytest.mark.slow
+def test_closures_that_two_processes_compiled_stay_apart(tmp_path: Path) -> None:
+    (tmp_path / "loops.py").write_text(_CLOSURES)
+
+    def call(*names: str) -> list[float]:
+        calls = ", ".join(f"loops.{name}(np.ones(9))" for name in names)
+        code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import numpy as np, loops; print([{calls}])"
+        run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300)
+        return json.loads(run.stdout)
+
+    # Each process compiles one caller, and its closure has the same number among the functions that it compiles.
+    once, twice = call("sum_once") + call("sum_twice")
+    assert once != twice and len(list((tmp_path / "__pycache__").glob("loops.sum_*.nbi"))) == 2, "both were kept"
+    assert call("sum_once", "sum_twice") == [once, twice]
+    assert call("sum_twice", "sum_once") == [twice, once]
+
+
+def test_functions_are_described_by_content() -> None:
+    def make(factor: Any) -> Any:
+        def scale(x: float) -> float:
+            return factor * x
+
+        return scale
+
+    def refer() -> Any:
+        def fall(x: int) -> int:
+            return fall(x - 1) if x else 0
+
+        return fall
+
+    assert _describe(make(1.0)) == _describe(make(1.0)) != _describe(make(2.0))
+    assert _describe(make(njit()(len_of))) == _describe(make(len_of)) != _describe(make(make))
+    assert _describe(make([])) != _describe(make([])), "unknown values are themselves alone"
+    assert "recursion" in repr(_describe(refer()))
+
+
+def len_of(x: Any) -> int:
+    return len(x)
 
 
 class _Slow(_LockedIndexFile):

@@ -5,6 +5,10 @@ numba numbers the cache files of a function's variants: two processes that compi
 for both, and later processes load the wrong variant without an error. Workers that start together on a fresh installation are such
 processes.
 
+numba tells functions of one name apart, such as closures of one definition, by a number that each process counts for itself.
+Code of two processes can have equal names for different functions, and a process that loads both from disk runs the first for
+both: wrong results, or memory written out of bounds. Here the number follows from what the function is.
+
 numba makes machine code of every loop that another one calls, and optimises it again in each caller. Here a loop that a compiled
 one calls is only linked into it, and optimised there, and so is what numba itself has of numpy's functions, so that a fresh
 installation compiles in about half the time. It has one form for all constants of a type that callers pass. A loop that Python
@@ -14,11 +18,14 @@ calls is compiled and kept as numba does it. Every compiled loop of the package 
 from __future__ import annotations
 
 import gc
+import hashlib
 import pickle
+import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from types import CodeType, FunctionType
 from typing import Any, Literal, TypeVar, cast
 
 import numpy as np
@@ -26,7 +33,7 @@ from filelock import FileLock
 from numba import jit
 from numba.core import caching, types
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler, CompilerBase, DefaultPassBuilder
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
 from numba.core.registry import CPUDispatcher
 from numba.core.typed_passes import NativeLowering
@@ -63,8 +70,17 @@ __all__ = [
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
+_NAMES = "names by content"
+"""Of the code on disk; code with other names is compiled anew."""
+_PROCESS = uuid.uuid4().hex
+"""Part of the number of functions whose content is unknown, so that no other process has it."""
+
+
 class _LockedIndexFile(caching.IndexDataCacheFile):
     """numba's index of a function's variants and of their files, locked while it is read or written."""
+
+    def __init__(self, cache_path: str, filename_base: str, source_stamp: Any) -> None:
+        super().__init__(cache_path, filename_base, (source_stamp, _NAMES))
 
     def load(self, key: Any) -> Any:
         with self._lock():
@@ -99,6 +115,35 @@ class _LinkedLibrary(JITCodeLibrary):
         self._finalized = True
 
 
+def _describe(value: Any, around: tuple[int, ...] = ()) -> Any:
+    """Return what a function, code, or value of a closure is, equal in all processes, or of this process alone.
+
+    around: of the values that it is a part of, by id.
+    """
+    if id(value) in around:
+        return "recursion", around.index(id(value))
+    describe = partial(_describe, around=(*around, id(value)))
+    if isinstance(value, CPUDispatcher):
+        return describe(value.py_func)
+    if isinstance(value, FunctionType):
+        cells = [cell.cell_contents for cell in value.__closure__ or ()]
+        return value.__module__, value.__qualname__, describe(value.__code__), [*map(describe, cells)]
+    if isinstance(value, CodeType):
+        return value.co_code.hex(), value.co_names, [*map(describe, value.co_consts)]
+    if isinstance(value, tuple):
+        return "tuple", [*map(describe, value)]
+    if value is None or isinstance(value, bool | int | float | complex | str | bytes | np.generic | types.Type):
+        return type(value).__name__, repr(value)
+    return _PROCESS, id(value)
+
+
+def _number_by_content(identity: Any, form: str) -> None:
+    """Name a function after its content before it is compiled; form: of its code, as one function has several."""
+    digest = hashlib.sha256(repr((form, _describe(identity.func))).encode()).digest()
+    identity.unique_id = int.from_bytes(digest[:8], "big")
+    identity.unique_name = f"{identity.func_qualname}${identity.unique_id}"
+
+
 @register_pass(mutates_CFG=True, analysis_only=False)
 class _LinkedLowering(NativeLowering):
     """numba's last pass, ending with a _LinkedLibrary."""
@@ -116,14 +161,23 @@ class _LinkedLowering(NativeLowering):
         return True
 
 
-class _LinkedCompiler(CompilerBase):
-    """numba's compiler, ending with a _LinkedLibrary."""
+class _LoopCompiler(CompilerBase):
+    """numba's compiler, of functions that are named after their content."""
+
+    lowering: type[NativeLowering] = NativeLowering
 
     def define_pipelines(self) -> list[Any]:
+        _number_by_content(self.state.func_id, type(self).__name__)
         manager = DefaultPassBuilder.define_nopython_pipeline(self.state)
-        manager.passes = [(_LinkedLowering if step is NativeLowering else step, why) for step, why in manager.passes]
+        manager.passes = [(self.lowering if step is NativeLowering else step, why) for step, why in manager.passes]
         manager.finalize()
         return [manager]
+
+
+class _LinkedCompiler(_LoopCompiler):
+    """The same, ending with a _LinkedLibrary."""
+
+    lowering = _LinkedLowering
 
 
 def _get_jit_decorator(self: _OverloadFunctionTemplate) -> Any:
@@ -143,7 +197,11 @@ class _CompiledLoop(CPUDispatcher):
     """A loop to be called from Python, and its form for callers that are compiled."""
 
     def __init__(
-        self, py_func: Any, locals: Any = None, targetoptions: Any = None, pipeline_class: type[CompilerBase] = Compiler
+        self,
+        py_func: Any,
+        locals: Any = None,
+        targetoptions: Any = None,
+        pipeline_class: type[CompilerBase] = _LoopCompiler,
     ) -> None:
         # Some versions of numba take no None.
         locals, targetoptions = locals or {}, {**(targetoptions or {}), "no_cfunc_wrapper": True}
