@@ -122,4 +122,4 @@ def test_a_perfect_crowd_reports_the_truth(name):
         own = observation.elements_in_map(crowd.true_poses[k])
         origin = crowd.origin[crowd.origin_offsets[k] : crowd.origin_offsets[k + 1]]
         for row in np.flatnonzero(own.kind != CROSSING):
-            assert shapely.distance(shapely.points(own.polyline(row)), shapes[origin[row]]).max() < 0.3
+            assert shapely.distance(shapely.points(own.polyline(int(row))), shapes[origin[row]]).max() < 0.3
