@@ -13,6 +13,7 @@ pytest.importorskip("shapely", reason="the 'map' extra is not installed")
 
 from manyeyes.cli import main as cli
 from manyeyes.maps.elements.observation_file import read_observations
+from manyeyes.maps.registry import OURS, TWO_AGENTS
 from manyeyes.studies.map_folder import read_vector_map
 
 
@@ -96,15 +97,31 @@ def test_export_writes_a_file_that_others_read(folder, tmp_path) -> None:
     assert len(json.loads((tmp_path / "all.geojson").read_text())["features"]) >= len(held["features"])
 
 
-def test_a_map_of_one_agent_states_why_nothing_is_published(folder, tmp_path, capsys) -> None:
+def test_a_map_of_one_agent_that_needs_two_states_why_nothing_is_published(folder, tmp_path, capsys) -> None:
     assert run("map", "simulate", "cross", "--observations", 1, "--size", 150, "--out", tmp_path) == 0
-    assert run("map", "fuse", tmp_path) == 0
+    assert run("map", "fuse", tmp_path, "--method", TWO_AGENTS, "--out", tmp_path / "map") == 0
     assert len(read_vector_map(tmp_path / "map")) > 0 and "No element is published" in capsys.readouterr().out
     assert run("map", "export", tmp_path / "map", tmp_path / "none.geojson") == 0
     assert "--trusted" in capsys.readouterr().out
     assert run("map", "export", tmp_path / "map", tmp_path / "all.geojson", "--include-unpublished") == 0
     assert run("map", "export", folder / "map", tmp_path / "map.geojson") == 0
     assert "No element is published" not in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_store_may_require_two_agents_also_after_a_retraction(tmp_path, capsys) -> None:
+    drive, store = tmp_path / "drive", str(tmp_path / "store")
+    assert run("map", "simulate", "cross", "--observations", 8, "--size", 150, "--out", drive) == 0
+    counts = []
+    for method in (OURS, TWO_AGENTS):
+        assert run("map", "fuse", drive, "--store", store, "--executor", "inline", "--method", method) == 0
+        counts.append(len(read_vector_map(store).select_published()))
+    assert counts[0] > counts[1]
+    agent = read_observations(drive / "observations").observations[0].agent
+    words = ("--agent", agent, "--reason", "test", "--executor", "inline", "--method", TWO_AGENTS)
+    assert run("map", "retract", store, *words) == 0
+    kept = read_vector_map(store).select_published()
+    assert len(kept) <= counts[1] and (kept.agents >= 2).all()
 
 
 @pytest.mark.slow
@@ -117,7 +134,7 @@ def test_a_store_takes_observations_and_other_commands_read_its_last_release(fol
     assert read_vector_map(store).quantised_hash() == read_vector_map(folder / "map").quantised_hash()
     assert run("map", "diff", folder / "map", store) == 0
     assert run("map", "fuse", folder, "--store", store, "--method", "union") == 1
-    assert "without --store" in capsys.readouterr().err
+    assert "A store is fused by manyeyes or manyeyes-two-agents; fuse without --store" in capsys.readouterr().err
 
 
 def test_import_reads_results_of_a_model(tmp_path, capsys) -> None:

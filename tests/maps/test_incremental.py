@@ -13,7 +13,8 @@ from manyeyes.datatypes.map_element import BOUNDARY, CROSSING, DIVIDER, MapEleme
 from manyeyes.maps.elements.observation import Observation
 from manyeyes.maps.elements.vector_map import PUBLISHED, VectorMap
 from manyeyes.maps.fusion.fuse import fuse
-from manyeyes.maps.fusion.incremental import IncrementalMap, compute_map_fscore
+from manyeyes.maps.fusion.incremental import IncrementalConfig, IncrementalMap, compute_map_fscore
+from manyeyes.maps.registry import make_two_agents_config
 
 VIEW = np.array([[-30.0, -15.0], [30.0, -15.0], [30.0, 15.0], [-30.0, 15.0]])
 SIDES = ((BOUNDARY, -5.25), (DIVIDER, -1.75), (DIVIDER, 1.75), (BOUNDARY, 5.25))
@@ -66,10 +67,21 @@ def test_a_map_is_built_from_an_empty_one():
 
 
 def test_one_observation_of_a_trusted_unit_is_published_at_once():
+    config = IncrementalConfig(fusion=make_two_agents_config())
     for trusted, published in ((True, 5), (False, 0)):
-        live = IncrementalMap(VectorMap.empty())
+        live = IncrementalMap(VectorMap.empty(), config=config)
         live.update(replace(make_observations(1)[0], trusted=trusted))
         assert len(live.build_map().select_published()) == published
+
+
+@pytest.mark.parametrize(("score", "published"), [(0.9, 5), (0.6, 1), (0.45, 0)])
+def test_one_observation_publishes_what_its_scores_make_probable(score, published):
+    """The calibrated probability reaches 0.7 at log-odds of 1.24 for lines in one view and 0.47 for the crossing."""
+    first = make_observations(1)[0]
+    first = replace(first, elements=replace(first.elements, score=np.full(len(first.elements), score)))
+    live = IncrementalMap(VectorMap.empty())
+    live.update(first)
+    assert len(live.build_map().select_published()) == len(fuse([first]).select_published()) == published
 
 
 def test_an_observation_counts_once():

@@ -17,7 +17,7 @@ from manyeyes.datatypes.map_element import DIVIDER, MapElements
 from manyeyes.maps.baselines.union import UnionConfig
 from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.observation_file import write_observations
-from manyeyes.maps.registry import MAP_FUSION_METHODS, OURS, fuse_maps, list_map_fusions
+from manyeyes.maps.registry import MAP_FUSION_METHODS, OURS, TWO_AGENTS, fuse_maps, list_map_fusions
 from manyeyes.studies.maps.fleet_cells import method_source
 
 THEIRS = """
@@ -60,7 +60,7 @@ def theirs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def test_our_method_comes_first_and_each_baseline_with_its_configuration() -> None:
     names = list_map_fusions()
-    assert names[0] == OURS and {"union", "polymerge", "crowdmap-literal"} < set(names)
+    assert names[:2] == (OURS, TWO_AGENTS) and {"union", "polymerge", "crowdmap-literal"} < set(names)
     assert MAP_FUSION_METHODS.get("union").config_class() == UnionConfig()
 
 

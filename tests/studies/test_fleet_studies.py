@@ -32,7 +32,7 @@ from manyeyes.evaluation.maps.registry import (
 )
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.fusion.fuse import MapFusionConfig
-from manyeyes.maps.registry import OURS, list_map_fusions
+from manyeyes.maps.registry import OURS, TWO_AGENTS, list_map_fusions
 from manyeyes.simulator.fleet.config import CROWDS
 from manyeyes.simulator.fleet.simulate import HONEST, MALICIOUS
 from manyeyes.studies.engine.cells import CellStore
@@ -45,10 +45,11 @@ from manyeyes.studies.maps.fusion import (
     compare_with_oracle,
     compute_paired_difference,
     find_best_baseline,
+    group_name,
     make_trials,
     run,
 )
-from manyeyes.studies.maps.tuning import SEARCH_SPACE, sample_changes
+from manyeyes.studies.maps.tuning import PLACES as TUNING_PLACES, SEARCH_SPACE, list_tuned_methods, sample_changes
 from manyeyes.studies.options import (
     FleetPoseNoiseOptions,
     FusionOptions,
@@ -124,7 +125,9 @@ def test_trials_cover_the_study() -> None:
     assert [(t.place, t.num_observations, t.seed) for t in fusion] == [
         ("cross", 20, 0), ("cross", 20, 1), ("cross", 60, 0), ("cross", 60, 1),
     ]  # fmt: skip
-    assert len(make_trials(FusionOptions(), range(3))) == 4 * 3 * 3
+    default = make_trials(FusionOptions(), range(3))
+    assert len(default) == 6 * 3 * 3
+    assert {t.place for t in default}.isdisjoint(TUNING_PLACES)
     noise = make_trials(FleetPoseNoiseOptions(), range(3))
     assert sorted({t.fleet_config.pose_sigma_m for t in noise}) == [0.0, 0.4, 0.8, 1.2, 1.5]
     assert noise[-1].fleet_config.yaw_sigma_rad == pytest.approx(math.radians(1.5))
@@ -132,6 +135,20 @@ def test_trials_cover_the_study() -> None:
     assert {(t.size_m, t.view_label) for t in table3} == {
         (s, w) for s in (300.0, 250.0) for w in ("local", "semi-global")
     }
+
+
+def test_places_of_another_shape_have_tables_of_their_own() -> None:
+    def name(place: str) -> str:
+        return group_name("fusion", replace(make_result("union", 20, 0, 0.5, 0.5), place=place))
+
+    assert name("Town03") == "20 observations"
+    assert name("roundabout") == name("merge") == "20 observations, other shapes"
+
+
+def test_our_row_with_two_agents_is_no_baseline() -> None:
+    results = [make_result(TWO_AGENTS, 20, 0, 0.9, 0.9), make_result("union", 20, 0, 0.5, 0.5)]
+    assert find_best_baseline(results, (OURS, TWO_AGENTS, "union"), "divider", "exact", "narrow") == "union"
+    assert find_best_baseline(results, (OURS, TWO_AGENTS), "divider", "exact", "narrow") is None
 
 
 def test_an_unknown_method_lists_the_known_and_oracles_are_no_methods() -> None:
@@ -243,16 +260,16 @@ def test_displacement_by_attack_is_compared_with_displacement_without_attack(mon
 
 
 def test_every_method_is_searched_over_its_own_fields_defaults_first() -> None:
-    assert set(SEARCH_SPACE) == set(list_map_fusions())
-    for method in list_map_fusions():
+    assert set(SEARCH_SPACE) == set(list_tuned_methods()) == set(list_map_fusions()) - {TWO_AGENTS}
+    for method in list_tuned_methods():
         assert sample_changes(method, 0) == ()
         config = make_default_config(method)
         draws = [apply_changes(config, sample_changes(method, k)) for k in range(6)]
         assert draws[0] == config and len({repr(d) for d in draws}) > 3
         assert {name for name, _ in sample_changes(method, 1)} == set(SEARCH_SPACE[method]), "a choice names no field"
-    changed = apply_changes(MapFusionConfig(), (("stations.evidence.publish_log_odds", 9.0),))
-    assert changed.stations.evidence.publish_log_odds == 9.0 and changed.pose_solver == MapFusionConfig().pose_solver
-    assert make_tuned_settings().config_of(OURS).stations.evidence.min_publish_agents == 1
+    changed = apply_changes(MapFusionConfig(), (("stations.evidence.min_publish_prob", 0.9),))
+    assert changed.stations.evidence.min_publish_prob == 0.9 and changed.pose_solver == MapFusionConfig().pose_solver
+    assert make_tuned_settings().config_of(OURS) == MapFusionConfig(), "a study publishes what the product publishes"
     assert make_tuned_settings().config_of("polymerge").min_fraction == 0.3 and make_tuned_settings().config_of(
         "union"
     ) == make_default_config("union")

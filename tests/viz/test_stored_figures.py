@@ -170,6 +170,15 @@ def test_lines_of_equal_values_differ_in_their_dashes() -> None:
     ]  # fmt: skip
 
 
+def test_places_of_another_shape_are_not_in_the_lines_over_observations() -> None:
+    groups = ("20 observations", "60 observations", "20 observations, other shapes")
+    rows = [{"group": group, "method": "union", "mean_ap": interval(0.4)} for group in groups]
+    (panel,) = FIGURES["map-observations"].make([stored({"summaries": rows})])
+    axes = Figure().add_subplot()
+    panel.draw(axes, LIGHT)
+    assert axes.lines[0].get_xdata().tolist() == [20.0, 60.0]
+
+
 def test_short_stages_of_a_step_are_one_bar() -> None:
     stages = {f"share: {name}": float(time) for name, time in zip("abcdef", (6, 5, 4, 3, 2, 1), strict=True)}
     row = {"case": "c", "weights": "w", "drive": 0, "agents": 4, "present_stages_ms": {**stages, "share: other": 9.0}}

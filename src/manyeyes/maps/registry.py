@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,7 +20,7 @@ from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.fusion.fuse import MapFusionConfig, fuse
 from manyeyes.maps.isolation import IsolatedFailure, isolate_failures
 
-OURS = "manyeyes"
+OURS, TWO_AGENTS = "manyeyes", "manyeyes-two-agents"
 FuseFunction = Callable[[Sequence[Observation], Any, MapFrame | None], VectorMap]
 Fuse = TypeVar("Fuse", bound=FuseFunction)
 
@@ -55,12 +55,21 @@ def register_map_fusion(name: str, config_class: Callable[[], Any]) -> Callable[
     return decorate
 
 
+def make_two_agents_config() -> MapFusionConfig:
+    """Return the default configuration, but publish nothing that fewer than two agents detected, except by a surveyed pole."""
+    config = MapFusionConfig()
+    evidence = replace(config.stations.evidence, min_publish_agents=2)
+    return replace(config, stations=replace(config.stations, evidence=evidence))
+
+
 register_map_fusion(OURS, MapFusionConfig)(fuse)
+register_map_fusion(TWO_AGENTS, make_two_agents_config)(fuse)
 
 
 def list_map_fusions() -> tuple[str, ...]:
     """Return the names of all methods, our own first."""
-    return (OURS, *(name for name in MAP_FUSION_METHODS.names() if name != OURS))
+    own = (OURS, TWO_AGENTS)
+    return (*own, *(name for name in MAP_FUSION_METHODS.names() if name not in own))
 
 
 def fuse_maps(

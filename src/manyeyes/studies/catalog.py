@@ -71,7 +71,7 @@ STUDIES = {
         _MODEL, "maps of whole towns, by map mode and fusion method (Table 3)", "maps.full_map", "FullMapOptions"),
     "map-pose-noise": Study(
         _MODEL, "tiles under pose noise, with and without pose correction", "maps.map_pose_noise", "MapPoseNoiseOptions"),
-    "fusion": Study(_FLEET, "fusion methods on four places that nothing was tuned on", "maps.fusion", "FusionOptions"),
+    "fusion": Study(_FLEET, "fusion methods on places that nothing was tuned on", "maps.fusion", "FusionOptions"),
     "fleet-pose-noise": Study(
         _FLEET, "fusion methods under pose noise of 0 to 1.5 m", "maps.fusion", "FleetPoseNoiseOptions"),
     "crowdmap-table3": Study(

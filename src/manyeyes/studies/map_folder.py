@@ -94,8 +94,8 @@ def print_none_published(num_published: int, num_elements: int, console: Console
     """Print why a map with elements has none that is published, and the remedy; nothing otherwise."""
     if num_elements and not num_published:
         console.print(
-            "No element is published: that takes detections by two agents, or a trusted observation ('manyeyes map import "
-            "--trusted'). 'manyeyes map export --include-unpublished' writes candidates, too.",
+            "No element is published: that takes detections with higher scores, by more agents, or by a trusted observation "
+            "('manyeyes map import --trusted'). 'manyeyes map export --include-unpublished' writes candidates, too.",
             highlight=False,
             soft_wrap=True,
         )

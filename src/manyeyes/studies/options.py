@@ -281,6 +281,8 @@ class FleetPoseNoiseOptions(MapFusionStudyOptions):
 class FusionOptions(FleetPoseNoiseOptions):
     """Options of the study fusion."""
 
+    places: tuple[str, ...] = ()
+    """Places; by default the four test places, and two of another shape in tables of their own."""
     observation_counts: tuple[TrialCount, ...] = ()
     """Counts of observations; by default 20, 60, 200."""
 

@@ -266,7 +266,8 @@ def _make_reliability(results: Sequence[StoredResult]) -> list[Panel]:
 
 
 def _make_map_observations(results: Sequence[StoredResult]) -> list[Panel]:
-    rows = [row for stored in results for row in stored.result["summaries"]]
+    # Places of another shape have groups of their own, in tables alone.
+    rows = [row for stored in results for row in stored.result["summaries"] if row["group"].endswith(" observations")]
     methods = list(dict.fromkeys(row["method"] for row in rows))
 
     def draw(axes: Any, theme: Theme) -> None:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
 
     from manyeyes.maps.elements.observation_file import LoadedObservations
+    from manyeyes.maps.fusion.fuse import MapFusionConfig
     from manyeyes.maps.store.executors import Executor
     from manyeyes.maps.store.store import MapStore
 
@@ -30,7 +31,8 @@ class Options:
     out: OutputFolder | None = None
     """Folder for the map, two GeoParquet files; 'map' beside the observations by default."""
     method: str = "manyeyes"
-    """A registered method: manyeyes, or a baseline such as union, chamfer-nms, polymerge; an unknown name lists all."""
+    """A registered method: manyeyes, manyeyes-two-agents, which publishes only what two agents detected, or a baseline such as
+    union, chamfer-nms, polymerge; an unknown name lists all."""
     store: str | None = None
     """Instead of a map's folder: a store, made if it is not there, which takes the observations in and publishes a release. A
     folder, or a URL such as s3://bucket/city; see docs/guides/map-cluster.md."""
@@ -115,8 +117,7 @@ def _fuse_into_store(options: Options, place: str, console: Console) -> None:
     from manyeyes.studies import provenance
     from manyeyes.studies.map_folder import report_rejected
 
-    if options.method != "manyeyes":
-        raise ConfigError(f"A store is fused by manyeyes' own method; fuse without --store for {options.method}.")
+    config = make_store_config(options.method)
     executor = make_executor(options.executor, options.workers, options.address)
     check_shared(place, options.executor)
     source = find_observation_files(options.observations)
@@ -125,7 +126,7 @@ def _fuse_into_store(options: Options, place: str, console: Console) -> None:
         ingested = log.ingest(source)
     known = len(log.rejected)
     report_rejected((*log.rejected, *ingested.rejected), console)
-    number = publish_release(store, executor, console)
+    number = publish_release(store, config, executor, console)
     report_rejected(log.rejected[known:], console)
     rejected = (*log.rejected, *ingested.rejected)
     payload = {
@@ -151,7 +152,16 @@ def check_shared(place: str, executor: str) -> None:
         raise ConfigError(f"{place} lies in the memory of one process; say --executor inline, or choose another store.")
 
 
-def publish_release(store: MapStore, executor: Executor, console: Console) -> int:
+def make_store_config(method: str) -> MapFusionConfig:
+    """Return the configuration with which a store is fused; ConfigError for a method that does not fuse by tiles."""
+    from manyeyes.maps.registry import MAP_FUSION_METHODS, OURS, TWO_AGENTS
+
+    if method not in (OURS, TWO_AGENTS):
+        raise ConfigError(f"A store is fused by {OURS} or {TWO_AGENTS}; fuse without --store for {method}.")
+    return MAP_FUSION_METHODS.get(method).config_class()
+
+
+def publish_release(store: MapStore, config: MapFusionConfig, executor: Executor, console: Console) -> int:
     """Fuse all observations of a store that count, publish the map, and return the release's number."""
     from manyeyes.viz.progress import make_progress_bars
 
@@ -164,4 +174,4 @@ def publish_release(store: MapStore, executor: Executor, console: Console) -> in
                 task = tasks[step] = progress.add_task(step, total=total)
             progress.update(task, completed=finished, total=total)
 
-        return store.fuse(executor=executor, progress=report).number
+        return store.fuse(config, executor=executor, progress=report).number

@@ -35,7 +35,7 @@ class MapOptions:
     sigma_m: LengthM | None = None
     """Lateral standard deviation of every point, metres, in place of those of the file (0.12 where it has none)."""
     trusted: bool = False
-    """Surveyed maps: one of them alone publishes an element."""
+    """Surveyed maps: their positions are exact, and their elements weigh more."""
     date: str | None = None
     """When the maps were made, such as 2026-03-01; by default when each file was last changed, of a store its last observation."""
 

@@ -16,7 +16,7 @@ class Options:
     """Which place, which crowd."""
 
     place: tyro.conf.Positional[str] = "cross"
-    """A CARLA town, av2-miami, av2-pittsburgh, lanelet2, cross, grid, or grid-N with N crossroads a side."""
+    """A CARLA town, av2-miami, av2-pittsburgh, lanelet2, cross, grid, grid-N with N crossroads a side, roundabout or merge."""
     observations: TrialCount = 60
     """How many; the first of a larger crowd are those of a smaller one."""
     crowd: str = "local"

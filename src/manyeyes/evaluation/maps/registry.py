@@ -33,15 +33,7 @@ class MethodSettings:
 
 ConfigChanges = tuple[tuple[str, Any], ...]
 # What ``manyeyes study tuning`` found, as changes of the defaults; a method that is not here stays with its own.
-# Ours: one agent suffices to publish, as in every baseline. Average precision ranks by score, so a line of one agent with a low
-# score costs nothing behind lines of many agents.
 TUNED_CHANGES: dict[str, ConfigChanges] = {
-    OURS: (
-        ("stations.evidence.publish_log_odds", 1.0),
-        ("stations.evidence.publish_crossing_log_odds", 0.5),
-        ("stations.evidence.publish_low_coverage_log_odds", 0.3),
-        ("stations.evidence.min_publish_agents", 1),
-    ),
     "chamfer-nms": (("max_chamfer_m", 0.75), ("rules.min_score", 0.2)),
     "polymerge": (("max_vertex_distance_m", 0.75), ("min_fraction", 0.3), ("rules.min_score", 0.5)),
     "heatmap-buffer": (("buffer_m", 0.5), ("min_view_fraction", 0.3), ("simplify_m", 0.1), ("rules.min_score", 0.0)),

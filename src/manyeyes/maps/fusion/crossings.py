@@ -9,7 +9,7 @@ rotation equivariant. A result that fills most of its rectangle becomes the rect
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -106,7 +106,7 @@ def fuse_crossings(
             build_visibility_index(arrays, pose), gather_observers(arrays, pose), gather_visibility_rings(arrays)
         ),
         styles,
-        replace(evidence_config, publish_log_odds=evidence_config.publish_crossing_log_odds).kernel_params,
+        evidence_config.to_kernel_params(CROSSING),
         (evidence_config.decay_time_s[CROSSING], config.min_overlap),
         evidence,
     )

@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, I64x2, U8x2, add_row, njit, set_row
-from manyeyes.datatypes.map_element import take_rows
+from manyeyes.datatypes.map_element import DIVIDER, KINDS, take_rows
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED
+from manyeyes.maps.fusion.existence_calibration import CROSSING_PROB, LINE_PROB, MIN_VIEWS, find_log_odds
 from manyeyes.maps.fusion.observation_arrays import DAY_NS, FieldsOfView, ObservationArrays, compute_visibility, is_line
 from manyeyes.maps.fusion.point_grid import build_grid, find_cell_range, line_residual, lower_bound
 
@@ -41,7 +42,8 @@ class EvidenceParameters(NamedTuple):
     """The values of EvidenceConfig as compiled loops read them; metres; min_cosine: cosine of the heading gate.
 
     hit, trusted_hit, miss: change of log-odds. max_log_odds: bound of their absolute value; max_initial_log_odds: before the first
-    detection. min_publish_agents, min_retire_agents: distinct agents.
+    detection. publish_one_view, publish_one, publish_two, publish_many: log-odds of publication by one agent in one view, one, two,
+    and more agents. min_publish_agents, min_retire_agents: distinct agents.
     """
 
     hit: float
@@ -49,7 +51,10 @@ class EvidenceParameters(NamedTuple):
     miss: float
     max_log_odds: float
     max_daily_change: float
-    publish: float
+    publish_one_view: float
+    publish_one: float
+    publish_two: float
+    publish_many: float
     retire: float
     margin_m: float
     max_longitudinal_m: float
@@ -72,9 +77,8 @@ class EvidenceConfig:
     max_log_odds: bound of |log-odds|; max_log_odds_before_detection: bound of negative log-odds before the first detection.
     max_daily_change: bound of the change by one agent in a day.
     score_low, score_high: scores at which a detection has weight 0 and 1; linear in between.
-    publish_log_odds: threshold of publication of a line's station, given min_publish_agents agents or a surveyed pole.
-    publish_crossing_log_odds: the same for a crossing.
-    publish_low_coverage_log_odds: the same for a line's station whose summed visibility is at most low_coverage.
+    min_publish_prob: calibrated probability (``existence_calibration``) from which a station of a line or a crossing is published,
+        given min_publish_agents agents or a surveyed pole.
     retire_log_odds: threshold of retirement, given misses by min_retire_agents agents.
     view_margin_m: distance from the border of a view within which a miss counts less.
     decay_time_s: by kind, time in which log-odds decay to 1/e.
@@ -91,11 +95,8 @@ class EvidenceConfig:
     max_daily_change: float = 2.0
     score_low: float = 0.4
     score_high: float = 0.7
-    publish_log_odds: float = 2.2
-    publish_crossing_log_odds: float = 2.2
-    publish_low_coverage_log_odds: float = 2.2
-    low_coverage: float = 3.0
-    min_publish_agents: int = 2
+    min_publish_prob: float = 0.7
+    min_publish_agents: int = 1
     retire_log_odds: float = -1.4
     min_retire_agents: int = 3
     view_margin_m: float = 2.0
@@ -117,25 +118,29 @@ class EvidenceConfig:
         """Compute the weight (E,) in [0, 1] of detections with these scores."""
         return np.clip((np.asarray(score) - self.score_low) / (self.score_high - self.score_low), 0.0, 1.0)
 
-    def publish_threshold(self, kind: Ints) -> Floats:
-        """Return the log-odds (K,) from which an element of each kind is published."""
-        return np.where(is_line(kind), self.publish_log_odds, self.publish_crossing_log_odds)
+    def publish_log_odds(self) -> Floats:
+        """Return the log-odds (4, 4) by kind from which an element is published, for each row of its table."""
+        tables = [LINE_PROB if line else CROSSING_PROB for line in is_line(np.arange(len(KINDS)))]
+        return np.array([[find_log_odds(row, self.min_publish_prob) for row in table] for table in tables])
 
     @property
     def log_odds_miss(self) -> float:
         """The change of log-odds by a miss in full visibility; negative."""
         return float(np.log((1 - self.detection_prob) / (1 - self.false_alarm_prob)))
 
-    @property
-    def kernel_params(self) -> EvidenceParameters:
-        """The configuration as compiled loops read it."""
+    def to_kernel_params(self, kind: int = DIVIDER) -> EvidenceParameters:
+        """Return the configuration as compiled loops read it, with the thresholds of a kind; those of all lines are the same."""
+        publish_one_view, publish_one, publish_two, publish_many = self.publish_log_odds()[kind].tolist()
         return EvidenceParameters(
             hit=self.log_odds_hit(),
             trusted_hit=self.log_odds_hit(trusted=True),
             miss=self.log_odds_miss,
             max_log_odds=float(self.max_log_odds),
             max_daily_change=float(self.max_daily_change),
-            publish=float(self.publish_log_odds),
+            publish_one_view=publish_one_view,
+            publish_one=publish_one,
+            publish_two=publish_two,
+            publish_many=publish_many,
             retire=float(self.retire_log_odds),
             margin_m=float(self.view_margin_m),
             max_longitudinal_m=float(self.max_longitudinal_m),
@@ -377,7 +382,7 @@ def accumulate_evidence(
         others,
         ObservationScene(index, gather_observers(arrays, pose), gather_visibility_rings(arrays)),
         styles,
-        config.kernel_params,
+        config.to_kernel_params(),
         np.array(config.decay_time_s),
         evidence,
     )
@@ -656,7 +661,10 @@ def update_existence(
             surveyed = surveyed or trusted[o]
         elif all_by > 0:
             missed_by += _count_once(scratch.missed_era, a, era_missed)
-        if odds >= params.publish and (seen_by >= params.min_publish_agents or surveyed):
+        publish = params.publish_two if seen_by == 2 else params.publish_many
+        if seen_by <= 1:
+            publish = params.publish_one_view if coverage < MIN_VIEWS else params.publish_one
+        if odds >= publish and (seen_by >= params.min_publish_agents or surveyed):
             state = PUBLISHED
             era_missed += 1
             missed_by = 0

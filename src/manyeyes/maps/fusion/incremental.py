@@ -341,7 +341,8 @@ class _EvidenceRows(NamedTuple):
         trusted = bool(s.trusted[0])
         limit = evidence.max_log_odds if trusted else evidence.max_daily_change
         odds = np.minimum(evidence.log_odds_hit(trusted) * score_weight, limit)
-        state = np.where(trusted & (odds >= evidence.publish_threshold(kind)), PUBLISHED, CANDIDATE)
+        may_publish = trusted or evidence.min_publish_agents <= 1
+        state = np.where(may_publish & (odds >= evidence.publish_log_odds()[kind, 0]), PUBLISHED, CANDIDATE)
         one = np.ones(count, np.int64)
         columns = {
             "sigma": np.full(count, 0.3),
@@ -362,7 +363,6 @@ class _EvidenceRows(NamedTuple):
     ) -> None:
         """Add to the log-odds of rows, with decay, daily bound per agent and clamping; then update their state."""
         evidence, time = config.fusion.stations.evidence, int(s.time_ns[0])
-        kinds = np.arange(len(KINDS))
         _add_log_odds(
             rows,
             np.broadcast_to(np.asarray(log_odds_change, np.float64), len(rows)),
@@ -374,7 +374,7 @@ class _EvidenceRows(NamedTuple):
                 float(evidence.min_publish_agents),
                 evidence.retire_log_odds,
                 np.array(evidence.decay_time_s),
-                evidence.publish_threshold(kinds),
+                evidence.publish_log_odds(),
             ),
         )
 
@@ -399,14 +399,16 @@ class _Update(NamedTuple):
 
 
 class _UpdateLimits(NamedTuple):
-    """Bounds of log-odds; decay_s and publish: (4,) by kind, time to 1/e and log-odds from which a row is published."""
+    """Bounds of log-odds; decay_s: (4,) by kind, time to 1/e; publish: (4, 4) by kind, log-odds of publication by
+    one agent in one view, one, two, or more agents.
+    """
 
     max_daily_change: float
     max_log_odds: float
     min_publish_agents: float
     retire: float
     decay_s: F64x1
-    publish: F64x1
+    publish: F64x2
 
 
 @njit(cache=True, nogil=True)
@@ -434,7 +436,7 @@ def _add_log_odds(
             t_last[k] = max(t_last[k], time)
         if odds <= retire:
             state[k] = RETIRED
-        elif hit and odds >= publish[kind[k]] and (trusted or agents[k] >= min_agents):
+        elif hit and odds >= publish[kind[k], min(max(agents[k], 1), 3)] and (trusted or agents[k] >= min_agents):
             state[k] = PUBLISHED
 
 
@@ -465,7 +467,9 @@ class _PlacedObservation(NamedTuple):
             fine.keys, fine.offsets, xy[order], tangent[order], weight[order], score_weight[order]
         )
         box = _ViewBounds(corner.min(0), corner.max(0))
-        return cls(np.ascontiguousarray(pose), order, points, box, gather_visibility_rings(s), evidence.kernel_params)
+        return cls(
+            np.ascontiguousarray(pose), order, points, box, gather_visibility_rings(s), evidence.to_kernel_params()
+        )
 
 
 @dataclass(eq=False)

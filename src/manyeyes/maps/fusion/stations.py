@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from manyeyes._jit import Boolx1, F64x2, I64x1, njit
 from manyeyes.datatypes.map_element import STYLES, take_rows
-from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED
+from manyeyes.maps.elements.vector_map import PUBLISHED, RETIRED
 from manyeyes.maps.fusion.coverage import clip_runs, find_observed_cells, merge_runs
 from manyeyes.maps.fusion.crossings import CrossingConfig, FusedCrossings, fuse_crossings
 from manyeyes.maps.fusion.existence import (
@@ -197,18 +197,11 @@ def _build_line_stations(
     stays = np.flatnonzero((found.support > 0) & (has_support | (found.state == RETIRED)))
     thinned = thin_ridges(places[stays], turned[stays], kind[stays], arrays.priority[seeds[stays]], config.ridge)
     stays = stays[thinned]
-    table = _publish_low_coverage(found.take(stays), config.evidence)
+    table = found.take(stays)
     places, turned = places[stays], turned[stays]
     loses = _find_conflicts(places, turned, table, config)
     chosen = np.flatnonzero(_within(places, area, 0.0) & ~loses & ((table.log_odds > 0.0) | (table.state != 0)))
     return places[chosen], turned[chosen], table.take(chosen)
-
-
-def _publish_low_coverage(table: EvidenceTable, config: EvidenceConfig) -> EvidenceTable:
-    """Publish candidates of low coverage whose log-odds reach their own threshold."""
-    low_coverage = (table.coverage <= config.low_coverage) & (table.log_odds >= config.publish_low_coverage_log_odds)
-    low_coverage &= (table.state == CANDIDATE) & (table.agents >= config.min_publish_agents)
-    return table._replace(state=np.where(low_coverage, PUBLISHED, table.state))
 
 
 def _compute_point_weights(

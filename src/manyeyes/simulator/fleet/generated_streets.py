@@ -67,7 +67,7 @@ def street_truth(plan: StreetPlan) -> MapElements:
             stations = np.arange(0.0, length + _STEP_M / 2, _STEP_M)
             stations = np.append(stations[stations < length - 1e-6], length)
             lines.append((kind, style, start + stations[:, None] * _TURN[way] + k * LANE_M * _TURN[(way + 1) % 4]))
-    placed = [(kind, style, _canonical(kind, plan.to_local(points))) for kind, style, points in lines]
+    placed = [(kind, style, canonical_points(kind, plan.to_local(points))) for kind, style, points in lines]
     placed.sort(key=lambda row: (row[0], *np.round(row[2][0], 6).tolist(), *np.round(row[2][-1], 6).tolist()))
     return MapElements.of(
         [row[2] for row in placed], [row[0] for row in placed], sigma=0.0, style=[row[1] for row in placed]
@@ -152,7 +152,7 @@ def _at_mouth(plan: StreetPlan, node: tuple[int, int], way: int) -> list[tuple[i
     return [(CROSSING, NO_STYLE, ring), (STOP_LINE, NO_STYLE, stop), (BOUNDARY, NO_STYLE, corner)]
 
 
-def _canonical(kind: int, points: Array) -> Array:
+def canonical_points(kind: int, points: Array) -> Array:
     """Return rings from their smallest corner, lines from their smaller end."""
     if kind == CROSSING:
         return np.roll(points, -int(np.lexsort(points.T[::-1])[0]), axis=0)

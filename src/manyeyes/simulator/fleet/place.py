@@ -22,6 +22,7 @@ from manyeyes.maps.formats.v2x_seq_map import read_v2x_seq_map
 from manyeyes.maps.roads.ground_truth import GroundTruthPolicy, build_ground_truth_map, compute_junction_region
 from manyeyes.maps.roads.road_network import RoadNetwork
 from manyeyes.maps.roads.transverse_mercator import degrees_from_metres
+from manyeyes.simulator.fleet.generated_roads import HALF_SIZE_M, make_merge, make_roundabout, road_truth
 from manyeyes.simulator.fleet.generated_streets import StreetPlan, street_junctions, street_routes, street_truth
 from manyeyes.simulator.fleet.routes import Routes
 from manyeyes.simulator.scene.roads import crossing_sites
@@ -55,7 +56,8 @@ _PLANS = {
     "cross": StreetPlan(lanes=3),
     "grid": StreetPlan(columns=4, rows=4, arm_m=90.0, lanes=2, warp_m=4.0, turn_rad=0.3),
 }
-PLACES = (*TOWNS, *AV2_LOGS, "lanelet2", *_PLANS)
+_LAYOUTS = {"roundabout": make_roundabout, "merge": make_merge}
+PLACES = (*TOWNS, *AV2_LOGS, "lanelet2", *_PLANS, *_LAYOUTS)
 MAX_GRID = 100
 """Maximum crossroads a side of a generated lattice."""
 
@@ -84,8 +86,8 @@ class Place:
 
 
 def load_place(name: str, size_m: float | None = 300.0, data: Path | str | None = None) -> Place:
-    """Return a place by name: a CARLA town, ``generated-<seed>``, av2-miami, av2-pittsburgh, lanelet2, cross, grid or
-    ``grid-<n>``.
+    """Return a place by name: a CARLA town, ``generated-<seed>``, av2-miami, av2-pittsburgh, lanelet2, cross, grid,
+    ``grid-<n>``, roundabout or merge.
 
     size_m: side of the square area; in towns it lies about the largest junction, None takes all of the place. Real logs and
     generated streets are never larger than they are. data: the folder with ``carla_opendrive``, ``av2`` and ``lanelet2``; where
@@ -111,6 +113,8 @@ def _load_place(name: str, size_m: float | None, data: str | None) -> Place:
     check_place(name)
     if name in _PLANS or name.startswith("grid-"):
         return _generate_place(name, size_m)
+    if name in _LAYOUTS:
+        return _lay_out_place(name, size_m)
     if name in TOWNS or name.startswith(GENERATED):
         folder = None if data is None or name.startswith(GENERATED) else Path(data) / "carla_opendrive"
         network = load_town(name, folder)
@@ -199,6 +203,15 @@ def _generate_place(name: str, size_m: float | None) -> Place:
     ground = shapely.union_all([shapely.Polygon(ring) for ring in street_junctions(plan)])
     area = (-float(half[0]), -float(half[1]), float(half[0]), float(half[1]))
     return Place(name, truth, routes.within(-half, half), ground, area, MapFrame(*_CARLA_ORIGIN))
+
+
+def _lay_out_place(name: str, size_m: float | None) -> Place:
+    """Return a place of roads that are no lattice."""
+    layout = _LAYOUTS[name]()
+    half = np.full(2, HALF_SIZE_M if size_m is None else min(HALF_SIZE_M, size_m / 2))
+    area = (-float(half[0]), -float(half[1]), float(half[0]), float(half[1]))
+    routes = layout.routes.within(-half, half)
+    return Place(name, road_truth(layout), routes, layout.ground, area, MapFrame(*_CARLA_ORIGIN))
 
 
 def _shift(ground: BaseGeometry, origin: Array) -> BaseGeometry:

@@ -25,7 +25,7 @@ from manyeyes.evaluation.maps.registry import check_method
 from manyeyes.evaluation.maps.spatial_bootstrap import BLOCK_SIZE_M
 from manyeyes.evaluation.statistics.bootstrap import BootstrapSamples, Interval
 from manyeyes.evaluation.statistics.comparison import Comparison
-from manyeyes.maps.registry import OURS, list_map_fusions
+from manyeyes.maps.registry import OURS, TWO_AGENTS, list_map_fusions
 from manyeyes.studies.engine.cells import hash_recording
 from manyeyes.studies.engine.report import StudyContext
 from manyeyes.studies.maps.model_study import MapModelStudy, prepare_map_study
@@ -161,7 +161,7 @@ def _make_comparisons(means: dict[str, dict[MapKey, BootstrapSamples]], methods:
         return average_samples([bootstraps[key] for bootstraps in means.values()])
 
     full_map = over_towns((SEMI_GLOBAL, OURS))
-    baselines = {method: over_towns((LOCAL, method)) for method in methods if method != OURS}
+    baselines = {method: over_towns((LOCAL, method)) for method in methods if method not in (OURS, TWO_AGENTS)}
     compared = {f"local + {method}": samples for method, samples in baselines.items()}
     if baselines:
         best = max(baselines, key=lambda method: baselines[method].value)
@@ -200,7 +200,9 @@ def _make_panels(
     """Draw for each town the truth, the best local baseline row, and the full map, centred on the truth."""
     out = []
     for town in town_results:
-        local_values = {key: d.value for key, d in means[town.name].items() if key[0] == LOCAL and key[1] != OURS}
+        local_values = {
+            key: d.value for key, d in means[town.name].items() if key[0] == LOCAL and key[1] not in (OURS, TWO_AGENTS)
+        }
         best = max(local_values, key=lambda key: local_values[key], default=(LOCAL, OURS))
         keys = [key for key in (best, (SEMI_GLOBAL, OURS)) if key in town.maps]
         if not keys:

@@ -19,7 +19,7 @@ from manyeyes.evaluation.maps.oracles import ORACLES
 from manyeyes.evaluation.maps.registry import check_method, make_tuned_settings
 from manyeyes.evaluation.statistics.bootstrap import Interval, mean_interval
 from manyeyes.evaluation.statistics.comparison import Comparison
-from manyeyes.maps.registry import OURS, list_map_fusions
+from manyeyes.maps.registry import OURS, TWO_AGENTS, list_map_fusions
 from manyeyes.simulator.fleet.config import CROWDS
 from manyeyes.simulator.fleet.place import check_place
 from manyeyes.studies.engine.report import StudyContext
@@ -28,6 +28,8 @@ from manyeyes.studies.options import FleetPoseNoiseOptions, FusionOptions, MapFu
 from manyeyes.viz.study_table import StudyTable, format_interval, format_number, make_comparison_table
 
 TEST_PLACES = ("Town03", "Town05", "av2-miami", "av2-pittsburgh")
+SHAPE_PLACES = ("roundabout", "merge")
+"""Generated places of another shape than the tuning places, in tables of their own."""
 OBSERVATION_COUNTS = (20, 60, 200)
 NOISE_SIGMAS_M = (0.0, 0.4, 0.8, 1.2, 1.5)
 NOISE_NUM_OBSERVATIONS = 100
@@ -80,7 +82,7 @@ def make_trials(options: MapFusionStudyOptions, seeds: Sequence[int]) -> list[Fl
     if isinstance(options, FusionOptions):
         return [
             FleetTrial(p, n, s, fleet_config=local)
-            for p in options.places or TEST_PLACES
+            for p in options.places or (*TEST_PLACES, *SHAPE_PLACES)
             for n in options.observation_counts or OBSERVATION_COUNTS
             for s in seeds
         ]
@@ -105,7 +107,7 @@ def group_name(study: str, result: FleetResult) -> str:
         return f"{result.pose_sigma_m:g} m"
     if study == "crowdmap-table3":
         return f"{result.size_m:g} m {result.place}, {result.view_label}"
-    return f"{result.num_observations} observations"
+    return f"{result.num_observations} observations" + (", other shapes" if result.place in SHAPE_PLACES else "")
 
 
 @dataclass(frozen=True)
@@ -200,8 +202,8 @@ def compare_with_oracle(group: str, results: Sequence[FleetResult]) -> list[Comp
 def find_best_baseline(
     results: Sequence[FleetResult], methods: Sequence[str], kind: str, protocol: str, thresholds: Thresholds
 ) -> str | None:
-    """Find the baseline with the greatest mean AP; of equal ones the first. Oracles are no baselines."""
-    baselines = [m for m in methods if m != OURS and m not in ORACLES]
+    """Find the baseline with the greatest mean AP; of equal ones the first. Oracles and our other row are no baselines."""
+    baselines = [m for m in methods if m not in (OURS, TWO_AGENTS, *ORACLES)]
     means = [_mean([r.get_ap(kind, protocol, thresholds) for r in results if r.method == m]) for m in baselines]
     known = [(-mean, k) for k, mean in enumerate(means) if not math.isnan(mean)]
     return baselines[min(known)[1]] if known else None

@@ -17,7 +17,7 @@ import numpy as np
 
 from manyeyes.evaluation.maps.experiment import FleetTrial
 from manyeyes.evaluation.maps.registry import MethodSettings, apply_changes, check_method, make_default_config
-from manyeyes.maps.registry import OURS, list_map_fusions
+from manyeyes.maps.registry import OURS, TWO_AGENTS, list_map_fusions
 from manyeyes.ops.keyed_random import keyed_uniform
 from manyeyes.simulator.fleet.config import CROWDS
 from manyeyes.studies.engine.report import StudyContext
@@ -41,10 +41,7 @@ SEARCH_SPACE: dict[str, SearchSpace] = {
         "pose_solver.points_per_independent": (4.0, 8.0, 16.0),
         "stations.min_support": (1, 2, 3),
         "stations.ridge.lateral_sigma_m": (0.35, 0.45, 0.6),
-        "stations.evidence.publish_log_odds": (1.0, 1.5, 2.2, 3.0),
-        "stations.evidence.publish_crossing_log_odds": (0.5, 1.0, 2.2),
-        "stations.evidence.publish_low_coverage_log_odds": (0.3, 1.0, 2.2),
-        "stations.evidence.min_publish_agents": (1, 2),
+        "stations.evidence.min_publish_prob": (0.5, 0.65, 0.75, 0.9),
         "link.max_join_gap_m": (6.0, 12.0, 18.0),
         "link.max_lateral_m": (0.25, 0.4, 0.6),
     },
@@ -90,6 +87,11 @@ class SearchTrial:
     mean_ap: float
 
 
+def list_tuned_methods() -> tuple[str, ...]:
+    """Return the methods that have a configuration of their own to tune."""
+    return tuple(name for name in list_map_fusions() if name != TWO_AGENTS)
+
+
 def sample_changes(method: str, config_index: int) -> tuple[tuple[str, Any], ...]:
     """Return the fields of one configuration; number 0 is the defaults."""
     if config_index == 0:
@@ -108,7 +110,7 @@ def run(options: TuningOptions, context: StudyContext) -> None:
     """Run the search and write its report."""
     for method in options.methods:
         check_method(method)
-    trials = run_random_search(context, options.methods or list_map_fusions(), options.workers)
+    trials = run_random_search(context, options.methods or list_tuned_methods(), options.workers)
     defaults = {trial.method: trial.mean_ap for trial in trials if trial.config_index == 0}
     best = {trial.method: trial for trial in reversed(trials)}
     lines = tuple(
