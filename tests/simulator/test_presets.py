@@ -106,21 +106,10 @@ def test_presets_of_published_tables_store_material_intensity_of_todays_sensors(
         assert specs == {("material", "none")}, name
 
 
-@pytest.mark.parametrize(
-    "name", ["carla-sensors-small", "no-vehicles", "near-field", "no-vehicles-large", "near-field-large"]
-)
+@pytest.mark.parametrize("name", ["carla-sensors-small", "no-vehicles", "near-field"])
 def test_training_scenes_of_mixed_sensors_store_material_intensity_which_other_laws_are_drawn_from(name: str) -> None:
     preset = simulation_preset(name)
     assert preset.intensity == "material" and any(part.split == "train" for part in preset.splits)
-
-
-@pytest.mark.parametrize(("name", "train"), [("no-vehicles", 300), ("near-field", 60)])
-def test_large_hard_cases_hold_the_scenes_of_the_small_ones(name: str, train: int) -> None:
-    small, large = ({job.spec for job in make_jobs(simulation_preset(n), 0)} for n in (name, f"{name}-large"))
-    counts = {part.split: part.count for part in simulation_preset(f"{name}-large").splits}
-    assert small < large and counts["train"] == train
-    seeds = {job.spec.seed for job in make_jobs(simulation_preset(f"{name}-large"), 0)}
-    assert len(seeds) == sum(counts.values())
 
 
 def test_mixed_sensors_train_on_the_towns_and_rates_stated() -> None:

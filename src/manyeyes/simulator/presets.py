@@ -203,12 +203,6 @@ def _hard_cases(train: int, val: int, test: int, more_val: tuple[str, ...] = ())
     )
 
 
-def _with_training_scenes(preset: SimulationPreset, count: int) -> SimulationPreset:
-    """Return the preset with so many training scenes, which begin with its own; the other splits are the same."""
-    train, *rest = preset.splits
-    return replace(preset, splits=(replace(train, count=count), *rest))
-
-
 # A single agent that is the only vehicle of its scene: every box that is detected is false.
 _NO_VEHICLES = SimulationPreset(
     _hard_cases(30, 12, 48, (f"{GENERATED}21",)),
@@ -253,8 +247,6 @@ SIMULATION_PRESETS: dict[str, SimulationPreset] = {
     "dair-crossing-tilted": replace(_CROSSING, lidar="dair-pandar40p"),
     "no-vehicles": _NO_VEHICLES,
     "near-field": _NEAR_FIELD,
-    "no-vehicles-large": _with_training_scenes(_NO_VEHICLES, 300),
-    "near-field-large": _with_training_scenes(_NEAR_FIELD, 60),
     "smoke-dair": replace(_CROSSING, splits=_SMOKE_SPLITS, frames=3, min_vehicles=4),
     "carla-sensors-small": _SENSORS,
     "carla-beams-16": _one_sensor("beams-16"),
