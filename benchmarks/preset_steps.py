@@ -113,7 +113,8 @@ def format_table(rows: list[dict[str, Any]]) -> str:
         name = f"`{row['preset']}`" if row["network"] == "preset" else "small network, same range"
         ap, seconds = row["ap50"], row["cpu_s_per_step"]
         shown = "" if seconds is None else f"{seconds:.2f}"
-        lines.append(f"| {name} | {row['steps']} | {ap['intermediate']:.3f} | {ap['none']:.3f} | {shown} |")
+        alone, together = (ap[method] for method in METHODS)
+        lines.append(f"| {name} | {row['steps']} | {together:.3f} | {alone:.3f} | {shown} |")
     return "\n".join(lines)
 
 
