@@ -5,7 +5,7 @@ numba numbers the cache files of a function's variants: two processes that compi
 for both, and later processes load the wrong variant without an error. Workers that start together on a fresh installation are such
 processes.
 
-numba tells functions of one name apart, such as closures of one definition, by a number that each process counts for itself.
+numba distinguishes functions of one name, such as closures of one definition, by a number that each process counts for itself.
 Code of two processes can have equal names for different functions, and a process that loads both from disk runs the first for
 both: wrong results, or memory written out of bounds. Here the number follows from what the function is.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibrated probability that a station exists, by its log-odds, the number of agents that detected it, and whether others looked.
+"""Calibrated probability that a station exists, by its log-odds, the number of agents that detected it, and whether others saw it.
 
 A station of a line exists if a true line of its kind lies within 0.5 m; a crossing, if it overlaps a true one with an intersection
 over union of 0.5. Log-odds assume independent errors, but a line of one agent has the pose error of that agent; and a detection of
