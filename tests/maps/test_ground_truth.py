@@ -109,6 +109,14 @@ def test_pavement_has_one_edge_on_each_side_and_none_where_the_map_ends():
     assert edges.lengths().min() > 93
 
 
+def test_the_policy_keeps_boundaries_whole_through_a_junction():
+    lanes = [lane(0, 0, 40, 0), lane(1, 40, 60, 0, "j"), lane(2, 60, 100, 0)]
+    marks = [mark(straight(0, 100, -2.2), "curb"), mark(straight(0, 100, 1.75), "broken")]
+    truth = build_ground_truth_map(network(marks, lanes), GroundTruthPolicy(boundary_cut="none"))
+    assert of(truth, BOUNDARY).lengths().tolist() == pytest.approx([100.0])
+    assert of(truth, DIVIDER).lengths().max() < 41
+
+
 def test_an_edge_far_from_any_lane_belongs_to_no_road():
     marks = [mark(straight(0, 40, -4.0), "curb"), mark(straight(0, 40, 40.0), "curb")]
     edges = build_ground_truth_map(network(marks, [lane(0, 0, 40, 0)]))

@@ -15,6 +15,7 @@ from manyeyes.models.maps.head import RawMap
 from manyeyes.training.maps.losses import (
     MapLossConfig,
     direction_loss,
+    edge_loss,
     focal_loss,
     head_terms,
     map_terms,
@@ -125,16 +126,17 @@ def test_perfect_prediction_leaves_only_the_classification_loss():
     point = torch.rand(1, 4, 6, 2)
     point[0, 2], point[0, 0], point[0, 3] = where[0].flip(0), where[1].roll(3, 0), where[2]
     terms = head_terms([RawMap(logit, point)], [targets(where, ring, kind)], CONFIG)
-    assert [float(t) for t in terms] == pytest.approx([0, 0, 0], abs=1e-5)
+    assert [float(t) for t in terms] == pytest.approx([0, 0, 0, 0], abs=1e-5)
 
 
 def test_terms_by_hand():
     # One line of three points from (0, 0) to (1, 0); one query, off by 0.1 in y at its end.
     target = targets([[[0.0, 0.0], [0.5, 0.0], [1.0, 0.0]]], [False], [0])
     raw = RawMap(torch.zeros(1, 1, 1), torch.tensor([[[[1.0, 0.1], [0.5, 0.0], [0.0, 0.0]]]]))
-    kind, point, direction = head_terms([raw, raw], [target], CONFIG)
+    kind, point, direction, edge = head_terms([raw, raw], [target], CONFIG)
     assert float(point) == pytest.approx(2 * 0.1)
     assert float(direction) == pytest.approx(2 * (1 - 0.5 / math.hypot(0.5, 0.1)), abs=1e-5)
+    assert float(edge) == pytest.approx(2 * 0.1)
     assert float(kind) == pytest.approx(2 * 0.25 * 0.25 * math.log(2))
 
 
@@ -148,6 +150,16 @@ def test_only_a_ring_has_a_closing_edge():
     assert line == pytest.approx(1.0) and ring == pytest.approx(2 - math.cos(math.pi / 4), abs=1e-5)
 
 
+def test_a_displaced_line_has_no_error_of_edges_and_an_uneven_one_has():
+    line = torch.tensor([[[0.0, 0.0], [0.25, 0.0], [0.5, 0.0]]])
+    moved, uneven = line + torch.tensor([0.1, -0.2]), line + torch.tensor([[0.0, 0.0], [0.1, 0.0], [0.0, 0.0]])
+    open_line, ring = torch.tensor([False]), torch.tensor([True])
+    assert edge_loss(moved, line, ring).tolist() == pytest.approx([0.0], abs=1e-6)
+    assert edge_loss(uneven, line, open_line).tolist() == pytest.approx([0.2])
+    assert edge_loss(line.flip(1), line, open_line).tolist() == pytest.approx([1.0])
+    assert edge_loss(line.flip(1), line, ring).tolist() == pytest.approx([2.0])
+
+
 def test_focal_loss_is_its_formula():
     logit = torch.tensor([-2.0, 0.3, 1.5], dtype=torch.float64)
     p = logit.sigmoid()
@@ -158,8 +170,8 @@ def test_focal_loss_is_its_formula():
 def test_tile_without_elements_has_only_negative_classification_loss():
     raw = RawMap(torch.zeros(1, 4, 3, requires_grad=True), torch.rand(1, 4, 6, 2, requires_grad=True))
     empty = MapTarget(torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.bool), torch.zeros(0, 12, 6, 2))
-    kind, point, direction = head_terms([raw], [empty], CONFIG)
-    assert float(kind.detach()) > 0 and float(point.detach()) == 0 == float(direction.detach())
+    kind, *rest = head_terms([raw], [empty], CONFIG)
+    assert float(kind.detach()) > 0 and not any(float(term.detach()) for term in rest)
     kind.backward()
     assert raw.logit.grad is not None and bool((raw.logit.grad > 0).all())
 

@@ -43,8 +43,9 @@ def has_images(recording: Recording) -> bool:
 
 
 def load_true_maps(recording: Recording) -> dict[str, MapElements]:
-    """Return the true map of every town that the recording's scenarios are named after, in its world frame; edges are the
-    pavement's.
+    """Return the true map of every town that the recording's scenarios are named after, in its world frame.
+
+    Edges are the pavement's, and go on around the corners of junctions: sweeps and images do not show where a junction begins.
     """
     from manyeyes.maps.roads.ground_truth import GroundTruthPolicy, build_ground_truth_map
     from manyeyes.simulator.scene.towns import GENERATED, TOWNS, load_town
@@ -52,4 +53,5 @@ def load_true_maps(recording: Recording) -> dict[str, MapElements]:
     town_by_lower_name = {town.lower(): town for town in TOWNS}
     named = sorted({scenario.rsplit("_", 1)[0] for scenario in recording.scenarios})
     towns = [name if name.startswith(GENERATED) else town_by_lower_name.get(name, name) for name in named]
-    return {town: build_ground_truth_map(load_town(town), GroundTruthPolicy(boundary="pavement")) for town in towns}
+    policy = GroundTruthPolicy(boundary="pavement", boundary_cut="none")
+    return {town: build_ground_truth_map(load_town(town), policy) for town in towns}

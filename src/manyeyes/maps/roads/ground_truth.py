@@ -12,8 +12,9 @@ benchmarks publish them with their results.
 3. A line within ``merge_radius_m`` and ``max_merge_heading_rad`` of a longer one of its class is the same line; what of it stands
 out stays.
 4. Lines whose ends lie within ``max_gap_m`` and continue each other's direction are one line.
-5. Cut policy ``junction``: lines are cut at the outline of each junction's lanes, widened by ``junction_margin_m``.
-   :func:`cut_elements` does the same to anybody's map. Attributes (style) do not cut.
+5. Cut policy ``junction``: boundaries are cut at the outline of each junction's lanes, widened by ``junction_margin_m``.
+   :func:`cut_elements` does the same to anybody's map. ``none``: a boundary goes on around the corners of junctions, since no
+   sensor measures where a junction begins. Attributes (style) do not cut.
 6. crossing: open rings, anticlockwise. stop_line: as drawn.
 Order and direction are canonical: elements by class and first point, lines from the lexicographically smaller end.
 """
@@ -52,6 +53,7 @@ class GroundTruthPolicy:
     """What counts as one element; the numbers of the module's list. Lengths in metres, angles in radians, areas in m²."""
 
     boundary: Literal["marks", "pavement"] = "marks"
+    boundary_cut: Literal["junction", "none"] = "junction"
     merge_radius_m: float = 0.3
     max_merge_heading_rad: float = 0.26
     max_gap_m: float = 0.5
@@ -78,7 +80,6 @@ class _StyledLine:
 def build_ground_truth_map(network: RoadNetwork, policy: GroundTruthPolicy = GroundTruthPolicy()) -> MapElements:
     """Return all true elements of a road network, in its world frame, by the rules of this module."""
     _shapely()
-    region = compute_junction_region(network, policy.junction_margin_m)
     paint = [mark for mark in network.marks if mark.kind in ("solid", "broken")]
     dividers = _clip_outside(_merge_double_lines(paint), compute_junction_region(network, policy.merge_radius_m))
     dividers = chain_lines(merge_duplicates(dividers, policy), policy)
@@ -88,7 +89,9 @@ def build_ground_truth_map(network: RoadNetwork, policy: GroundTruthPolicy = Gro
         edges = [_StyledLine(mark.line[:, :2], _one_hot_style("none")) for mark in network.marks if mark.kind == "curb"]
     edges = _keep_near_lanes(_drop_map_ends(edges, network), network, policy)
     boundaries = chain_lines(merge_duplicates(edges, policy), policy)
-    boundaries = [piece for line in boundaries for piece in _split_line(line, region, policy.min_line_length_m)]
+    if policy.boundary_cut == "junction":
+        region = compute_junction_region(network, policy.junction_margin_m)
+        boundaries = [piece for line in boundaries for piece in _split_line(line, region, policy.min_line_length_m)]
     stops = [_StyledLine(mark.line[:, :2], _one_hot_style("none")) for mark in network.marks if mark.kind == "stop"]
     found: list[tuple[str, _StyledLine]] = []
     found += [("divider", line) for line in dividers if line.length_m >= policy.min_line_length_m]

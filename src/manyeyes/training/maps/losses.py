@@ -3,14 +3,15 @@
 
 Sources: MapTR (ICLR 2023) and MapTRv2 (IJCV 2024), with their published weights but for segmentation, which weighs
 ten times as much
-(docs/concepts/map-model.md); focal loss, Lin et al., ICCV 2017. Point terms are sums over an element's points and means over
-elements.
+(docs/concepts/map-model.md); focal loss, Lin et al., ICCV 2017. The loss of edges is ours. Point terms are sums over an element's
+points and means over elements.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -34,16 +35,37 @@ class MapLossConfig:
         max_match_distance: maximum mean L1 distance of an element's points, in fractions of the tile, at which a
             query is matched. Without a nearby line in the line field, only the line field has something to learn.
             Learned queries need an infinite distance.
+        edge: weight of the error of the vectors between neighbouring points, so of their direction and spacing; a
+            displaced line has none.
     """
 
     classification: float = 2.0
     point: float = 5.0
     direction: float = 0.005
+    edge: float = 0.0
     segmentation: float = 10.0
     line_field: float = 2.0
     one_to_many_repeats: int = 2
     max_match_distance: float = 0.2
     one_to_many: float = 1.0
+
+
+class HeadTerms(NamedTuple):
+    """Loss terms of one group of queries, as scalars, summed over the head's layers."""
+
+    classification: Tensor
+    point: Tensor
+    direction: Tensor
+    edge: Tensor
+
+    def total(self, config: MapLossConfig) -> Tensor:
+        """Return the weighted sum."""
+        return (
+            config.classification * self.classification
+            + config.point * self.point
+            + config.direction * self.direction
+            + config.edge * self.edge
+        )
 
 
 @dataclass(frozen=True)
@@ -57,6 +79,7 @@ class MapLossTerms:
     classification: Tensor
     point: Tensor
     direction: Tensor
+    edge: Tensor
     segmentation: Tensor
     line_field: Tensor
     one_to_many: Tensor
@@ -65,15 +88,13 @@ class MapLossTerms:
     def without_elements(cls, segmentation: Tensor, line_field: Tensor) -> MapLossTerms:
         """Make the terms of a step without decoder."""
         nothing = line_field.new_zeros(())
-        return cls(nothing, nothing, nothing, segmentation, line_field, nothing)
+        return cls(nothing, nothing, nothing, nothing, segmentation, line_field, nothing)
 
     def total(self, config: MapLossConfig) -> Tensor:
         """Return the weighted sum of all terms."""
-        own = (
-            config.classification * self.classification + config.point * self.point + config.direction * self.direction
-        )
+        own = HeadTerms(self.classification, self.point, self.direction, self.edge)
         return (
-            own
+            own.total(config)
             + config.segmentation * self.segmentation
             + config.line_field * self.line_field
             + config.one_to_many * self.one_to_many
@@ -111,15 +132,11 @@ def match_queries(logit: Tensor, point: Tensor, target: MapTarget, config: MapLo
     return QueryMatch(query, element, target.orders[element, best[query, element]])
 
 
-def head_terms(
-    layers: Sequence[RawMap], targets: Sequence[MapTarget], config: MapLossConfig
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return (classification, point, direction) of one group of queries, each layer matched separately, summed over
-    layers.
-    """
+def head_terms(layers: Sequence[RawMap], targets: Sequence[MapTarget], config: MapLossConfig) -> HeadTerms:
+    """Compute the loss terms of one group of queries, each layer matched separately."""
     queries = layers[0].logit.shape[1]
     num_matches = max(1, sum(min(len(target), queries) for target in targets))
-    kind = point = direction = layers[0].logit.new_zeros(())
+    kind = point = direction = edge = layers[0].logit.new_zeros(())
     for raw in layers:
         hot = torch.zeros_like(raw.logit)
         for tile, target in enumerate(targets):
@@ -128,8 +145,9 @@ def head_terms(
             matched, ring = raw.point[tile, found.query], target.ring[found.element]
             point = point + (matched - found.points).abs().sum() / num_matches
             direction = direction + direction_loss(matched, found.points, ring).sum() / num_matches
+            edge = edge + edge_loss(matched, found.points, ring).sum() / num_matches
         kind = kind + focal_loss(raw.logit, hot).sum() / num_matches
-    return kind, point, direction
+    return HeadTerms(kind, point, direction, edge)
 
 
 def direction_loss(predicted: Tensor, target: Tensor, ring: Tensor) -> Tensor:
@@ -137,6 +155,12 @@ def direction_loss(predicted: Tensor, target: Tensor, ring: Tensor) -> Tensor:
     edge.
     """
     gap = 1 - F.cosine_similarity(predicted.roll(-1, 1) - predicted, target.roll(-1, 1) - target, dim=2, eps=1e-6)
+    return gap[:, :-1].sum(1) + gap[:, -1] * ring
+
+
+def edge_loss(predicted: Tensor, target: Tensor, ring: Tensor) -> Tensor:
+    """Return (M,) sums of L1 distances between the edges of two polylines (M, P, 2); rings (M,) include the closing edge."""
+    gap = ((predicted.roll(-1, 1) - predicted) - (target.roll(-1, 1) - target)).abs().sum(2)
     return gap[:, :-1].sum(1) + gap[:, -1] * ring
 
 
@@ -167,10 +191,9 @@ def map_terms(
     config: MapLossConfig,
 ) -> MapLossTerms:
     """Compute all terms of one batch of tiles; many is empty without one-to-many queries."""
-    kind, point, direction = head_terms(one, targets, config)
-    extra = kind.new_zeros(())
+    own = head_terms(one, targets, config)
+    extra = own.point.new_zeros(())
     if many:
         repeated = [target.repeat(config.one_to_many_repeats) for target in targets]
-        more = head_terms(many, repeated, config)
-        extra = config.classification * more[0] + config.point * more[1] + config.direction * more[2]
-    return MapLossTerms(kind, point, direction, segmentation, line_field, extra)
+        extra = head_terms(many, repeated, config).total(config)
+    return MapLossTerms(*own, segmentation, line_field, extra)

@@ -11,7 +11,13 @@ from manyeyes.training.maps.losses import MapLossConfig
 from manyeyes.training.maps.samples import MapAugmentConfig
 from manyeyes.training.maps.task import MapTrainConfig
 
-_NOISY = MapAugmentConfig(sigma_xy_m=0.2, sigma_yaw_rad=math.radians(0.3))
+_NOISY = MapAugmentConfig(
+    sigma_xy_m=0.2,
+    sigma_yaw_rad=math.radians(0.3),
+    bend_probability=0.4,
+    max_curvature=1 / 40,
+    curved_candidates=3,
+)
 _SMALL = MapTrainConfig(
     get_map_model_config("small"),
     steps=2000,
@@ -23,6 +29,7 @@ _SMALL = MapTrainConfig(
     line_field_steps=700,
     calibration_tiles=64,
     augment=_NOISY,
+    loss=MapLossConfig(edge=5.0),
 )
 
 MAP_TRAINING_PRESETS: dict[str, MapTrainConfig] = {
