@@ -131,6 +131,13 @@ def test_local_maps_are_clipped_to_the_window_ahead(map_model, source):
     np.testing.assert_allclose(np.sort(drawings[0].truth.points, 0), [[0, 2], [30, 2]], atol=1e-4)
 
 
+def test_local_maps_of_one_kind_of_agent(map_model, source):
+    every = LocalPredictor()(map_model, source, "town1_0000", 0)
+    vehicles, roadside = (LocalPredictor((kind,))(map_model, source, "town1_0000", 0) for kind in (VEHICLE, ROADSIDE))
+    assert [d.row_name for d in (*vehicles, *roadside)] == [d.row_name for d in every]
+    np.testing.assert_array_equal(roadside[0].predicted.points, every[2].predicted.points)
+
+
 def test_pose_noise_moves_others_features_and_the_corrector_gets_boxes(map_model, source, monkeypatch):
     """The corrector is asked with the noisy looks and their boxes, and what it returns is drawn from."""
     received, car = [], Boxes.of(torch.tensor([[4.0, 1.0, 0.8]]), torch.tensor([[4.5, 1.9, 1.6]]), torch.tensor([0.3]))

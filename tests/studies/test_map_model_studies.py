@@ -3,6 +3,7 @@
 
 import json
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -185,13 +186,45 @@ def test_each_larger_number_of_frames_is_compared_with_one():
 
 
 def test_local_maps_have_a_row_for_each_kind_of_agent(weights, tmp_path, monkeypatch):
-    monkeypatch.setattr(local, "LocalPredictor", lambda: make_predictor({VEHICLE: 6, ROADSIDE: 2}))
+    monkeypatch.setattr(local, "LocalPredictor", lambda rows=(): make_predictor({VEHICLE: 6, ROADSIDE: 2}))
     result, text = study("local", weights, tmp_path)
     assert [(r["name"], r["mean_ap"][0]["value"]) for r in result["rows"]["LiDAR"]] == [
         (VEHICLE, 1.0),
         (ROADSIDE, 0.25),
     ]
     assert "CrowdMap's Table 1" in text
+
+
+def test_roadside_units_may_have_weights_of_their_own(weights, tmp_path, monkeypatch, capsys):
+    opened, parts = [], {VEHICLE: 6, ROADSIDE: 2}
+    load = model_study.pretrained.load_map_model
+    monkeypatch.setattr(
+        model_study.pretrained, "load_map_model", lambda name: opened.append(Path(name).stem) or load(name)
+    )
+    monkeypatch.setattr(local, "LocalPredictor", lambda rows: make_predictor({row: parts[row] for row in rows}))
+    own = save(tmp_path / "roadside.safetensors", towns=("town01",))
+    result, _ = study("local", weights, tmp_path, "--roadside-weights", own)
+    assert [(r["name"], r["mean_ap"][0]["value"], r["num_tiles"]) for r in result["rows"]["LiDAR"]] == [
+        (VEHICLE, 1.0, 6),
+        (ROADSIDE, 0.25, 6),
+    ]
+    assert {"random", "roadside"} <= set(opened)
+    # Models of other sensors than the vehicles' are no row of the same table.
+    camera = save(tmp_path / "camera.safetensors", ("camera",))
+    words = (
+        "study",
+        "local",
+        "--data",
+        tmp_path,
+        "--weights",
+        weights,
+        "--roadside-weights",
+        camera,
+        "--out",
+        tmp_path,
+    )
+    assert cli.main([*map(str, words), "--workers", "1"]) == 1
+    assert "the same sensors" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.slow

@@ -127,6 +127,29 @@ def test_samples_are_keyed_and_have_several_frames():
     assert counts == {1, 2, 3, 4, 5, 6}
 
 
+class DrivesWithPoles(Drives):
+    """The second agent of each scenario is a roadside unit, but in the last there is none."""
+
+    def snapshot(self, scenario, index):
+        first, second = super().snapshot(scenario, index).frames
+        second = dataclasses.replace(second, is_infrastructure=scenario != "bton_0")
+        return Snapshot(scenario, index, (first, second))
+
+
+@pytest.mark.parametrize(("agents", "kinds"), [("all", {0, 1}), ("vehicles", {0}), ("roadside-units", {1})])
+def test_frames_of_one_kind_of_agent(agents, kinds):
+    augment = MapAugmentConfig(1, 6, agents=agents)
+    drawn = [TileStream(DrivesWithPoles(), MAPS, CONFIG, augment, 0).draw(number) for number in range(20)]
+    assert {int(frame.is_infrastructure) for sample in drawn for frame in sample.frames} == kinds
+    assert len({len(sample.frames) for sample in drawn}) > 3
+
+
+def test_a_recording_without_the_wanted_agents_is_refused():
+    augment = MapAugmentConfig(agents="roadside-units")
+    with pytest.raises(ConfigError, match="have no roadside-units"):
+        TileStream(Drives(), MAPS, CONFIG, augment, 0).draw(0)
+
+
 def test_pose_errors_move_frames_and_not_the_truth():
     noisy = dataclasses.replace(EXACT, min_frames=4, sigma_xy_m=0.5, sigma_yaw_rad=0.02)
     exact, moved = stream(dataclasses.replace(EXACT, min_frames=4)).draw(3), stream(noisy).draw(3)

@@ -65,7 +65,7 @@ STUDIES = {
         "pose.pose_estimation", "PoseEstimationOptions"),
     "feakm": Study(
         _POSE, "ablation of FeaKM: confidence map and fusion scales (Table 3)", "pose.feakm", "FeakmOptions"),
-    "local": Study(_MODEL, "local maps of single agents (Table 1)", "maps.local", "MapModelOptions"),
+    "local": Study(_MODEL, "local maps of single agents (Table 1)", "maps.local", "LocalMapOptions"),
     "semi-global": Study(_MODEL, "tiles from one to ten frames (Table 2)", "maps.semi_global", "MapModelOptions"),
     "full-map": Study(
         _MODEL, "maps of whole towns, by map mode and fusion method (Table 3)", "maps.full_map", "FullMapOptions"),

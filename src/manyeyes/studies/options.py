@@ -332,6 +332,14 @@ class MapModelOptions(FleetStudyOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class LocalMapOptions(MapModelOptions):
+    """Options of the study local."""
+
+    roadside_weights: tuple[str, ...] = ()
+    """Map models of roadside units, where they have their own; those of --weights then predict for vehicles alone."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class FullMapOptions(MapModelOptions):
     """Options of the study full-map."""
 

@@ -64,7 +64,10 @@ class LocalPredictor:
     """Predict the local map ahead of each agent of a scenario; one row for vehicles and one for roadside units.
 
     The model predicts its whole tile around the agent; the window is cut out of it, as in the map mode local.
+    rows: the kinds of agents to predict for.
     """
+
+    rows: tuple[str, ...] = (VEHICLE, ROADSIDE)
 
     @property
     def cache_key(self) -> str:
@@ -75,16 +78,15 @@ class LocalPredictor:
         """Return one drawing an agent."""
         snapshot, out = sample_meeting(source, scenario, seed), []
         for row, frame in enumerate(snapshot.frames):
+            name = ROADSIDE if frame.is_infrastructure else VEHICLE
+            if name not in self.rows:
+                continue
             tile, window = make_local_tile(source, snapshot, row)
             received = _ReceivedFeatures.of(map_model, frame)
             predicted = crop_to_tile(
                 predict_tile(map_model, received.messages, tile.world_from_tile), Transform.identity(), window
             )
-            out.append(
-                TilePrediction(
-                    ROADSIDE if frame.is_infrastructure else VEHICLE, predicted, tile.truth, received.num_bytes
-                )
-            )
+            out.append(TilePrediction(name, predicted, tile.truth, received.num_bytes))
         return out
 
 

@@ -7,7 +7,6 @@ centre, and goes on straight beyond; distances from it are kept. Heights do not 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -94,8 +93,3 @@ def find_near_elements(elements: MapElements, reach_m: float) -> MapElements:
     bounds = elements.bounds()
     outside = np.maximum(np.maximum(bounds[:, :2], -bounds[:, 2:]), 0.0).max(1) if len(elements) else np.zeros(0)
     return elements.take(outside <= reach_m)
-
-
-def has_images(frames: Sequence[AgentFrame]) -> bool:
-    """Return whether a frame has images, which cannot be bent."""
-    return any(frame.images for frame in frames)

@@ -18,6 +18,7 @@ _NOISY = MapAugmentConfig(
     max_curvature=1 / 40,
     curved_candidates=3,
 )
+_ONE_FRAME = replace(_NOISY, max_frames=1)
 _SMALL = MapTrainConfig(
     get_map_model_config("small"),
     steps=2000,
@@ -45,6 +46,10 @@ MAP_TRAINING_PRESETS: dict[str, MapTrainConfig] = {
         calibration_tiles=2,
     ),
     "map-small-lidar": _SMALL,
+    "map-small-vehicle": replace(_SMALL, steps=600, line_field_steps=0, augment=replace(_ONE_FRAME, agents="vehicles")),
+    "map-small-roadside": replace(
+        _SMALL, steps=600, line_field_steps=0, augment=replace(_ONE_FRAME, agents="roadside-units")
+    ),
     "map-small-camera": replace(
         _SMALL, map_model=get_map_model_config("small", ("camera",)), steps=1200, line_field_steps=300
     ),
@@ -71,5 +76,6 @@ MAP_TRAINING_PRESETS: dict[str, MapTrainConfig] = {
 }
 """map-tiny: tests. map-small-lidar, map-small-camera, map-small-fusion: one to ten frames a tile, trainable on two CPU cores; the
 two with cameras need images in the recording, and their steps suffice when initialised with trained weights (--weights).
+map-small-vehicle, map-small-roadside: of one frame of one kind of agent (CrowdMap's Table 1), initialised with map-small-lidar.
 map-paper: ten images a tile and batches of eight tiles as in the paper; steps and learning rate are those of MapTRv2.
 """

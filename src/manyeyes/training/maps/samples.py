@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 import torch
@@ -20,17 +20,21 @@ from torch import Tensor
 
 from manyeyes.datasets.base import Recording
 from manyeyes.datasets.frame_reader import FrameReader, as_frame_reader
-from manyeyes.datatypes import AgentFrame, BevGrid, Camera, CameraImage, Transform
+from manyeyes.datatypes import AgentFrame, BevGrid, Camera, CameraImage, ConfigError, Transform
 from manyeyes.datatypes.map_element import CROSSING, KINDS, MapElements
 from manyeyes.evaluation.maps.curvature import measure_curved_length
 from manyeyes.evaluation.maps.tiles import check_town_split, crop_to_tile, find_town, to_xy_yaw
 from manyeyes.models.maps.map_model import FRAMES_PER_TILE, MapModelConfig
 from manyeyes.ops.keyed_random import keyed_generator
 from manyeyes.ops.polyline import resample_spaced
-from manyeyes.training.maps.bending import REACH_M, Bend, find_near_elements, has_images
+from manyeyes.training.maps.bending import REACH_M, Bend, find_near_elements
 from manyeyes.training.mirroring import mirror_factors, resize_cloud, resize_transform
 
 Floats = NDArray[np.float64]
+AgentKind = Literal["all", "vehicles", "roadside-units"]
+
+MAX_DRAWS = 1000
+"""Draws of a frame after which a recording has no agent of the wanted kind."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,7 @@ class MapAugmentConfig:
         max_curvature: of a bent tile, 1/m; it is uniform to both sides.
         curved_candidates: number of places that are drawn for a tile, of which the one with most curved dividers is taken, in
             half of the tiles; 1 takes the first.
+        agents: kind of agents whose frames are taken.
     """
 
     min_frames: int = 1
@@ -91,6 +96,11 @@ class MapAugmentConfig:
     bend_probability: float = 0.0
     max_curvature: float = 1 / 50
     curved_candidates: int = 1
+    agents: AgentKind = "all"
+
+    def takes(self, frame: AgentFrame) -> bool:
+        """Return whether the frame is of the wanted kind of agent."""
+        return self.agents == "all" or frame.is_infrastructure == (self.agents == "roadside-units")
 
 
 @dataclass(frozen=True)
@@ -122,12 +132,14 @@ class TileStream:
         return as_frame_reader(self.recording)
 
     @cached_property
-    def _places(self) -> dict[str, Floats]:
-        """Initial positions (agents, 2) of the agents of each scenario, world frame."""
-        first = {s: self.recording.snapshot(s, 0).frames for s in self.recording.scenarios}
-        return {
-            s: np.array([f.world_from_agent.translation[:2].tolist() for f in frames]) for s, frames in first.items()
-        }
+    def _places(self) -> tuple[tuple[str, int, Floats], ...]:
+        """Scenario, row and initial position (2,), world frame, of every agent of the wanted kind."""
+        return tuple(
+            (scenario, row, frame.world_from_agent.translation[:2].numpy())
+            for scenario in self.recording.scenarios
+            for row, frame in enumerate(self.recording.snapshot(scenario, 0).frames)
+            if self.augment.takes(frame)
+        )
 
     def draw(self, number: int) -> MapSample:
         """Draw a tile around a uniform scenario, frame and agent, and frames of it, roadside units first."""
@@ -143,15 +155,26 @@ class TileStream:
 
     def _draw_place(self, rng: np.random.Generator) -> tuple[str, AgentFrame, Transform]:
         """Draw a scenario, a frame of an agent, and a tile around it (world_from_tile)."""
-        augment, scenarios = self.augment, self.recording.scenarios
-        scenario = scenarios[int(rng.integers(len(scenarios)))]
-        index = int(rng.integers(self.recording.length(scenario)))
-        present = self._frames.present_agents(scenario, index)
-        own = self._frames.frame(scenario, index, present[int(rng.integers(len(present)))])
+        augment = self.augment
+        scenario, own = self._draw_frame(rng)
         turn = float(own.world_from_agent.yaw) + augment.max_yaw_rad * rng.uniform(-1, 1)
         shift = augment.max_shift_m * rng.uniform(-1, 1, 2)
         middle = own.world_from_agent.translation[:2].numpy() + shift
         return scenario, own, Transform.from_xyz_yaw(float(middle[0]), float(middle[1]), 0.0, turn)
+
+    def _draw_frame(self, rng: np.random.Generator) -> tuple[str, AgentFrame]:
+        """Draw a uniform scenario, frame and agent, again until the agent is of the wanted kind."""
+        scenarios = self.recording.scenarios
+        for _ in range(MAX_DRAWS):
+            scenario = scenarios[int(rng.integers(len(scenarios)))]
+            index = int(rng.integers(self.recording.length(scenario)))
+            present = self._frames.present_agents(scenario, index)
+            own = self._frames.frame(scenario, index, present[int(rng.integers(len(present)))])
+            if self.augment.takes(own):
+                return scenario, own
+        raise ConfigError(
+            f"{MAX_DRAWS} frames of the recording have no {self.augment.agents}; give one that has, or set augment.agents to all."
+        )
 
     def _measure_curves(self, place: tuple[str, AgentFrame, Transform]) -> float:
         scenario, _, world_from_tile = place
@@ -162,12 +185,7 @@ class TileStream:
     def _sample_frames(self, scenario: str, middle: Floats, count: int, rng: np.random.Generator) -> list[AgentFrame]:
         """Draw frames of nearby agents, each at its own instant; one of a roadside unit first, where there is one."""
         town, reach = self._town(scenario), self.map_model.tile.x_max + self.map_model.bev.grid.x_max / 2
-        near = [
-            (s, row)
-            for s, places in self._places.items()
-            if self._town(s) == town
-            for row in np.flatnonzero(np.hypot(*(places - middle).T) <= reach).tolist()
-        ]
+        near = [(s, row) for s, row, at in self._places if self._town(s) == town and np.hypot(*(at - middle)) <= reach]
         order = rng.permutation(len(near))
         # In half of the tiles, agents of the same scenario come first, as in traffic.
         if rng.random() < 0.5:
@@ -187,7 +205,8 @@ class TileStream:
         augment, config = self.augment, self.map_model
         world = self.maps[self._town(scenario)]
         tile_from_world = world_from_tile.inverse()
-        if augment.bend_probability > 0 and not has_images(frames) and rng.random() < augment.bend_probability:
+        can_bend = augment.bend_probability > 0 and not any(frame.images for frame in frames)
+        if can_bend and rng.random() < augment.bend_probability:
             bend = Bend(float(augment.max_curvature * rng.uniform(0.1, 1) * rng.choice((-1.0, 1.0))))
             near = find_near_elements(world.transform(*to_xy_yaw(tile_from_world)), 3 * REACH_M)
             world, world_from_tile = bend.bend_elements(near), Transform.identity()
