@@ -134,7 +134,10 @@ def test_a_store_takes_observations_and_other_commands_read_its_last_release(fol
     assert read_vector_map(store).quantised_hash() == read_vector_map(folder / "map").quantised_hash()
     assert run("map", "diff", folder / "map", store) == 0
     assert run("map", "fuse", folder, "--store", store, "--method", "union") == 1
-    assert "A store is fused by manyeyes or manyeyes-two-agents; fuse without --store" in capsys.readouterr().err
+    assert (
+        "A store is fused by manyeyes, manyeyes-two-agents, manyeyes-map-model; fuse without --store"
+        in capsys.readouterr().err
+    )
 
 
 def test_import_reads_results_of_a_model(tmp_path, capsys) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import linecache
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from manyeyes.datatypes.map_element import DIVIDER, MapElements
 from manyeyes.maps.baselines.union import UnionConfig
 from manyeyes.maps.elements.observation import MapFrame, Observation
 from manyeyes.maps.elements.observation_file import write_observations
-from manyeyes.maps.registry import MAP_FUSION_METHODS, OURS, TWO_AGENTS, fuse_maps, list_map_fusions
+from manyeyes.maps.registry import MAP_FUSION_METHODS, MAP_MODEL, OURS, VARIANTS, fuse_maps, list_map_fusions
 from manyeyes.studies.maps.fleet_cells import method_source
 
 THEIRS = """
@@ -60,8 +61,18 @@ def theirs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 def test_our_method_comes_first_and_each_baseline_with_its_configuration() -> None:
     names = list_map_fusions()
-    assert names[:2] == (OURS, TWO_AGENTS) and {"union", "polymerge", "crowdmap-literal"} < set(names)
+    assert names[:3] == (OURS, *VARIANTS) and {"union", "polymerge", "crowdmap-literal"} < set(names)
     assert MAP_FUSION_METHODS.get("union").config_class() == UnionConfig()
+
+
+def test_lines_that_map_models_detect_in_half_of_the_views_are_published_by_their_variant() -> None:
+    """Eight agents with one view each; four of them detect a line, with scores that the default gives little weight."""
+    seen, unseen = MapElements.of([[[0.0, 1.0], [40.0, 1.0]]], DIVIDER, score=[0.45]), MapElements.of([], DIVIDER)
+    observations = [
+        replace(observe(agent), elements=seen if number % 2 else unseen) for number, agent in enumerate("abcdefgh")
+    ]
+    published = {m: len(fuse_maps(observations, m).select_published().elements) for m in (OURS, MAP_MODEL)}
+    assert published == {OURS: 0, MAP_MODEL: 1}
 
 
 def test_observations_and_their_file_give_one_map(tmp_path: Path) -> None:

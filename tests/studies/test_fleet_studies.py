@@ -32,7 +32,7 @@ from manyeyes.evaluation.maps.registry import (
 )
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.fusion.fuse import MapFusionConfig
-from manyeyes.maps.registry import OURS, TWO_AGENTS, list_map_fusions
+from manyeyes.maps.registry import OURS, TWO_AGENTS, VARIANTS, list_map_fusions
 from manyeyes.simulator.fleet.config import CROWDS
 from manyeyes.simulator.fleet.simulate import HONEST, MALICIOUS
 from manyeyes.studies.engine.cells import CellStore
@@ -260,7 +260,7 @@ def test_displacement_by_attack_is_compared_with_displacement_without_attack(mon
 
 
 def test_every_method_is_searched_over_its_own_fields_defaults_first() -> None:
-    assert set(SEARCH_SPACE) == set(list_tuned_methods()) == set(list_map_fusions()) - {TWO_AGENTS}
+    assert set(SEARCH_SPACE) == set(list_tuned_methods()) == set(list_map_fusions()) - {*VARIANTS}
     for method in list_tuned_methods():
         assert sample_changes(method, 0) == ()
         config = make_default_config(method)

@@ -26,7 +26,7 @@ from manyeyes.evaluation.maps.metrics import MapMetrics, evaluate_map
 from manyeyes.evaluation.maps.registry import make_tuned_settings
 from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.fusion.incremental import IncrementalConfig, compute_map_fscore
-from manyeyes.maps.registry import OURS
+from manyeyes.maps.registry import MAP_MODEL, OURS
 from manyeyes.studies.map_folder import MapFolder, write_vector_map
 from manyeyes.studies.town_maps import TownMap
 from manyeyes.viz.map_figures import MapPanel, save_figure
@@ -112,8 +112,9 @@ def build_map(
     recording: Recording, town_map: TownMap, config: MapBuildConfig, on_snapshot: Callable[[], None] = lambda: None
 ) -> BuiltMap:
     """Build the map of one town; on_snapshot is called after each snapshot."""
+    method = OURS if config.map_model is None else MAP_MODEL
     map_server = MapServer(
-        town_map.frame, town_map.origin_xy, config=IncrementalConfig(fusion=make_tuned_settings().config_of(OURS))
+        town_map.frame, town_map.origin_xy, config=IncrementalConfig(fusion=make_tuned_settings().config_of(method))
     )
     log = _BuildLog()
     for scenario in town_map.scenarios:

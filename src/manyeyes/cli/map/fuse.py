@@ -31,7 +31,8 @@ class Options:
     out: OutputFolder | None = None
     """Folder for the map, two GeoParquet files; 'map' beside the observations by default."""
     method: str = "manyeyes"
-    """A registered method: manyeyes, manyeyes-two-agents, which publishes only what two agents detected, or a baseline such as
+    """A registered method: manyeyes, manyeyes-two-agents, which publishes only what two agents detected, manyeyes-map-model, for
+    observations of the shipped map models, or a baseline such as
     union, chamfer-nms, polymerge; an unknown name lists all."""
     store: str | None = None
     """Instead of a map's folder: a store, made if it is not there, which takes the observations in and publishes a release. A
@@ -154,10 +155,10 @@ def check_shared(place: str, executor: str) -> None:
 
 def make_store_config(method: str) -> MapFusionConfig:
     """Return the configuration with which a store is fused; ConfigError for a method that does not fuse by tiles."""
-    from manyeyes.maps.registry import MAP_FUSION_METHODS, OURS, TWO_AGENTS
+    from manyeyes.maps.registry import MAP_FUSION_METHODS, OURS, VARIANTS
 
-    if method not in (OURS, TWO_AGENTS):
-        raise ConfigError(f"A store is fused by {OURS} or {TWO_AGENTS}; fuse without --store for {method}.")
+    if method not in (OURS, *VARIANTS):
+        raise ConfigError(f"A store is fused by {', '.join((OURS, *VARIANTS))}; fuse without --store for {method}.")
     return MAP_FUSION_METHODS.get(method).config_class()
 
 

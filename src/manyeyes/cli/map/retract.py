@@ -31,7 +31,7 @@ class Options:
     fuse: bool = True
     """Fuse and publish a release at once; else the next fusion leaves them out."""
     method: str = "manyeyes"
-    """The method of the release: manyeyes, or manyeyes-two-agents where 'map fuse --store' was called with it."""
+    """The method of the release: manyeyes, or the variant that 'map fuse --store' was called with."""
     executor: str = "process"
     """What fuses the tiles: inline, process, dask or ray."""
     workers: WorkerCount | None = None

@@ -25,7 +25,7 @@ from manyeyes.evaluation.maps.registry import check_method
 from manyeyes.evaluation.maps.spatial_bootstrap import BLOCK_SIZE_M
 from manyeyes.evaluation.statistics.bootstrap import BootstrapSamples, Interval
 from manyeyes.evaluation.statistics.comparison import Comparison
-from manyeyes.maps.registry import OURS, TWO_AGENTS, list_map_fusions
+from manyeyes.maps.registry import MAP_MODEL, OURS, VARIANTS, list_map_fusions
 from manyeyes.studies.engine.cells import hash_recording
 from manyeyes.studies.engine.report import StudyContext
 from manyeyes.studies.maps.model_study import MapModelStudy, prepare_map_study
@@ -38,6 +38,7 @@ from manyeyes.viz.study_table import StudyTable, format_interval, format_number,
 LOCAL, SEMI_GLOBAL = "local", "semi-global"
 MAP_MODES = (SEMI_GLOBAL, LOCAL)
 FIGURE_HALF_SIZE_M = 150.0
+OWN_METHODS = (OURS, *VARIANTS)
 PAPER_TABLE = StudyTable(
     "CrowdMap's Table 3: two crossroads of DAIR-V2X; for reference only",
     ("method", "Map-06 AP crossing", "AP divider", "mAP", "Map-13 AP crossing", "AP divider", "mAP"),
@@ -154,23 +155,29 @@ def _make_row(town: TownResults, key: MapKey, mean_ap: BootstrapSamples) -> Full
 
 def _make_comparisons(means: dict[str, dict[MapKey, BootstrapSamples]], methods: Sequence[str]) -> list[Comparison]:
     """Compare semi-global maps with our fusion with each row of local maps, as the mean over towns."""
-    if OURS not in methods:
+    own = select_own_method(methods)
+    if own is None:
         return []
 
     def over_towns(key: MapKey) -> BootstrapSamples:
         return average_samples([bootstraps[key] for bootstraps in means.values()])
 
-    full_map = over_towns((SEMI_GLOBAL, OURS))
-    baselines = {method: over_towns((LOCAL, method)) for method in methods if method not in (OURS, TWO_AGENTS)}
+    full_map = over_towns((SEMI_GLOBAL, own))
+    baselines = {method: over_towns((LOCAL, method)) for method in methods if method not in OWN_METHODS}
     compared = {f"local + {method}": samples for method, samples in baselines.items()}
     if baselines:
         best = max(baselines, key=lambda method: baselines[method].value)
         compared[f"local + {best}, the best baseline"] = baselines[best]
-    compared[f"local + {OURS}"] = over_towns((LOCAL, OURS))
+    compared[f"local + {own}"] = over_towns((LOCAL, own))
     return [
-        Comparison(f"{SEMI_GLOBAL} + {OURS} - {name}", "mAP", full_map.paired_difference(samples))
+        Comparison(f"{SEMI_GLOBAL} + {own} - {name}", "mAP", full_map.paired_difference(samples))
         for name, samples in compared.items()
     ]
+
+
+def select_own_method(methods: Sequence[str]) -> str | None:
+    """Return the row of ours that is compared: the one for observations of map models, else the default."""
+    return next((method for method in (MAP_MODEL, OURS) if method in methods), None)
 
 
 def _make_table(town: str, rows: Sequence[FullMapRow]) -> StudyTable:
@@ -198,13 +205,13 @@ def _make_panels(
     town_results: Sequence[TownResults], means: dict[str, dict[MapKey, BootstrapSamples]]
 ) -> list[MapPanel]:
     """Draw for each town the truth, the best local baseline row, and the full map, centred on the truth."""
-    out = []
+    out, own = [], select_own_method([method for town in town_results for _, method in town.maps]) or MAP_MODEL
     for town in town_results:
         local_values = {
-            key: d.value for key, d in means[town.name].items() if key[0] == LOCAL and key[1] not in (OURS, TWO_AGENTS)
+            key: d.value for key, d in means[town.name].items() if key[0] == LOCAL and key[1] not in OWN_METHODS
         }
-        best = max(local_values, key=lambda key: local_values[key], default=(LOCAL, OURS))
-        keys = [key for key in (best, (SEMI_GLOBAL, OURS)) if key in town.maps]
+        best = max(local_values, key=lambda key: local_values[key], default=(LOCAL, own))
+        keys = [key for key in (best, (SEMI_GLOBAL, own)) if key in town.maps]
         if not keys:
             continue
         truth = town.maps[SEMI_GLOBAL, keys[-1][1]][0].truth

@@ -19,7 +19,7 @@ from manyeyes.evaluation.maps.oracles import ORACLES
 from manyeyes.evaluation.maps.registry import check_method, make_tuned_settings
 from manyeyes.evaluation.statistics.bootstrap import Interval, mean_interval
 from manyeyes.evaluation.statistics.comparison import Comparison
-from manyeyes.maps.registry import OURS, TWO_AGENTS, list_map_fusions
+from manyeyes.maps.registry import MAP_MODEL, OURS, VARIANTS, list_map_fusions
 from manyeyes.simulator.fleet.config import CROWDS
 from manyeyes.simulator.fleet.place import check_place
 from manyeyes.studies.engine.report import StudyContext
@@ -55,7 +55,9 @@ def run(options: MapFusionStudyOptions, context: StudyContext) -> None:
     if isinstance(options, FleetPoseNoiseOptions):
         for place in options.places:
             check_place(place)
-    methods = (*(options.methods or list_map_fusions()), *(ORACLES if options.oracles else ()))
+    # Agents of a fleet detect lines as the defaults describe.
+    default_methods = tuple(name for name in list_map_fusions() if name != MAP_MODEL)
+    methods = (*(options.methods or default_methods), *(ORACLES if options.oracles else ()))
     settings, store = make_tuned_settings(), context.store
     jobs = [FleetJob(trial, methods, settings, store) for trial in make_trials(options, range(options.seeds))]
     results = [r for job_results in context.run_jobs(jobs, options.workers, "Trials") for r in job_results]
@@ -202,8 +204,8 @@ def compare_with_oracle(group: str, results: Sequence[FleetResult]) -> list[Comp
 def find_best_baseline(
     results: Sequence[FleetResult], methods: Sequence[str], kind: str, protocol: str, thresholds: Thresholds
 ) -> str | None:
-    """Find the baseline with the greatest mean AP; of equal ones the first. Oracles and our other row are no baselines."""
-    baselines = [m for m in methods if m not in (OURS, TWO_AGENTS, *ORACLES)]
+    """Find the baseline with the greatest mean AP; of equal ones the first. Oracles and our other rows are no baselines."""
+    baselines = [m for m in methods if m not in (OURS, *VARIANTS, *ORACLES)]
     means = [_mean([r.get_ap(kind, protocol, thresholds) for r in results if r.method == m]) for m in baselines]
     known = [(-mean, k) for k, mean in enumerate(means) if not math.isnan(mean)]
     return baselines[min(known)[1]] if known else None

@@ -17,7 +17,7 @@ import numpy as np
 
 from manyeyes.evaluation.maps.experiment import FleetTrial
 from manyeyes.evaluation.maps.registry import MethodSettings, apply_changes, check_method, make_default_config
-from manyeyes.maps.registry import OURS, TWO_AGENTS, list_map_fusions
+from manyeyes.maps.registry import OURS, VARIANTS, list_map_fusions
 from manyeyes.ops.keyed_random import keyed_uniform
 from manyeyes.simulator.fleet.config import CROWDS
 from manyeyes.studies.engine.report import StudyContext
@@ -89,7 +89,7 @@ class SearchTrial:
 
 def list_tuned_methods() -> tuple[str, ...]:
     """Return the methods that have a configuration of their own to tune."""
-    return tuple(name for name in list_map_fusions() if name != TWO_AGENTS)
+    return tuple(name for name in list_map_fusions() if name not in VARIANTS)
 
 
 def sample_changes(method: str, config_index: int) -> tuple[tuple[str, Any], ...]:
