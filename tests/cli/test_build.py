@@ -192,7 +192,8 @@ def test_the_command_on_a_simulated_recording(tmp_path, capsys) -> None:
     simulate("smoke-opv2v", tmp_path / "tiny")
     words = ["map", "build", str(tmp_path / "tiny"), "--split", "test", "--source", "truth", "--frame-stride", "2"]
     assert cli.main([*words, "--out", str(tmp_path / "out")]) == 0
-    assert "against the truth in view" in " ".join(capsys.readouterr().out.split())
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "against the truth in view" in printed and "all observations together, unfused" in printed
     held = json.loads((tmp_path / "out" / "build.json").read_text())
     (numbers,) = held["result"]
     assert numbers["name"] == "generated-3" and numbers["num_observations"] == numbers["num_messages"] > 2

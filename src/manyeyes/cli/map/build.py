@@ -134,6 +134,8 @@ def _print_summary(console: Console, stats: MapBuildStats, out: Path) -> None:
     s = stats
     if s.scores is not None:
         console.print(make_kinds_table(s.scores, f"{s.name}: the map against the truth in view"))
+        if s.union_scores is not None:
+            console.print(make_kinds_table(s.union_scores, f"{s.name}: all observations together, unfused"))
     else:
         console.print(f"{s.name}: no true map is known by this name, so the map is not evaluated.", highlight=False)
     console.print(
