@@ -22,6 +22,8 @@ from manyeyes._io import atomic_write
 
 T = TypeVar("T")
 
+_PLAIN = (str, int, float, bool)
+
 
 def save_record(path: Path, value: object, durable: bool = False) -> None:
     """Write a value to a file: whole, or not there; durable: also after a loss of power.
@@ -96,6 +98,8 @@ def _unpack(hint: Any, packed: Any, file: io.BufferedIOBase) -> Any:
         return hint(**{name: _unpack(hints[name], item, file) for name, item in zip(names, packed)})
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is tuple:
+        if arguments[0] in _PLAIN and arguments[1:] == (Ellipsis,):
+            return tuple(packed)
         item_hints = arguments[:1] * len(packed) if arguments[-1] is Ellipsis else arguments
         return tuple(_unpack(item_hint, item, file) for item_hint, item in zip(item_hints, packed, strict=True))
     if origin in (Union, types.UnionType):
