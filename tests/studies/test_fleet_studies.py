@@ -38,7 +38,7 @@ from manyeyes.simulator.fleet.simulate import HONEST, MALICIOUS
 from manyeyes.studies.engine.cells import CellStore
 from manyeyes.studies.engine.report import StudyContext
 from manyeyes.studies.maps import fleet_cells, malicious_agents as malicious_study
-from manyeyes.studies.maps.adversarial import AdversarialJob
+from manyeyes.studies.maps.adversarial import AdversarialJob, make_summary_table
 from manyeyes.studies.maps.fleet_cells import FleetJob, FleetResult, make_cell
 from manyeyes.studies.maps.fusion import (
     compare_with_best,
@@ -257,6 +257,17 @@ def test_displacement_by_attack_is_compared_with_displacement_without_attack(mon
     assert len(fused_inputs) == 6, "honest observations are fused once, and the truth of all once"
     again = [AdversarialJob(trial, MethodSettings(), store)() for trial in trials]
     assert repr(again) == repr(found) and len(fused_inputs) == 6, "a study that was stopped goes on"
+
+
+def test_displaced_stations_add_up_over_places_and_seeds_by_attack() -> None:
+    def make(place: str, attack: str, displaced: int) -> adversarial.AdversarialResult:
+        return adversarial.AdversarialResult(place, 0, attack, 2.0, 10, 2, 1000, displaced, 1, 30, 0.1, 0.2)
+
+    results = [make("a", "independent", 5), make("b", "independent", 700), make("a", "colluding", 9)]
+    assert make_summary_table(results).lines == (
+        ("independent", "2", "2,000", "705", "60", "2", "700"),
+        ("colluding", "2", "1,000", "9", "30", "1", "9"),
+    )
 
 
 def test_every_method_is_searched_over_its_own_fields_defaults_first() -> None:

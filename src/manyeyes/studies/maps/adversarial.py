@@ -24,6 +24,10 @@ HEADINGS = (
     "p99 [m]", "max [m]",
 )  # fmt: skip
 
+SUMMARY_HEADINGS = (
+    "attack", "offset [m]", "stations", "displaced > 0.1 m", "displaced without attack", "lost", "displaced in one trial at most",
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class AdversarialJob:
@@ -50,7 +54,24 @@ def run(options: AdversarialOptions, context: StudyContext) -> None:
     jobs = [AdversarialJob(trial, settings, context.store) for trial in trials]
     results = context.run_jobs(jobs, options.workers, "Trials")
     title = "Displacement by malicious agents of stations that five or more agents observed"
-    context.write_report(title, {"trials": results}, [_make_table(results)], config={"settings": settings})
+    tables = [make_summary_table(results), _make_table(results)]
+    context.write_report(title, {"trials": results}, tables, config={"settings": settings})
+
+
+def make_summary_table(results: Sequence[AdversarialResult]) -> StudyTable:
+    """Add up the stations over places and seeds, beside those that as many honest agents displace; the most of one trial apart."""
+    groups: dict[tuple[str, float], list[AdversarialResult]] = {}
+    for result in results:
+        groups.setdefault((result.attack, result.offset_m), []).append(result)
+    lines = []
+    for (attack, offset_m), part in groups.items():
+        sums = [
+            sum(getattr(r, name) for r in part)
+            for name in ("num_stations", "num_displaced", "num_displaced_without_attack", "num_lost")
+        ]
+        most = max(r.num_displaced for r in part)
+        lines.append((attack, f"{offset_m:g}", *(f"{n:,}" for n in (*sums, most))))
+    return StudyTable("Displaced stations by attack", SUMMARY_HEADINGS, tuple(lines))
 
 
 def _make_table(results: Sequence[AdversarialResult]) -> StudyTable:
