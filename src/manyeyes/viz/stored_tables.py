@@ -117,11 +117,14 @@ def _has_no_recording(result: dict[str, Any]) -> bool:
     return is_pose_lines(result) or is_pose_rows(result) or _is_speed(result) or _has_simulated_scenes(result)
 
 
+_SIMULATED_STUDIES = ("adversarial", "malicious-agents", "map-incremental", "false-accusations", "signatures")
+
+
 def _has_simulated_scenes(result: dict[str, Any]) -> bool:
     """Return whether a result is of the step, of the cost of maps, of the live runtime or of a study of drives or map fusion, which
     simulate what they need.
     """
-    simulates = "summaries" in result or result.get("study") in ("malicious-agents", "false-accusations", "signatures")
+    simulates = "summaries" in result or result.get("study") in _SIMULATED_STUDIES
     simulates |= "load_before" in result
     return simulates or "costs" in result or "present_stages_ms" in (result.get("rows") or [{}])[0]
 
