@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The map part of the demo: one map of a junction from the local maps of a crowd that crosses it.
 
-One drive of four agents is too little for a map: what is published must be observed by several agents, so that most of the road is
-left out, and the F1 of dividers is below that of all observations. ``manyeyes map build`` makes such a map of a recording.
+One drive of four agents shows little of what fusion does: each line is observed by few agents with the errors of one model.
+``manyeyes map build`` makes such a map of a recording.
 """
 
 from __future__ import annotations
