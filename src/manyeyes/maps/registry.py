@@ -59,17 +59,20 @@ def register_map_fusion(name: str, config_class: Callable[[], Any]) -> Callable[
 
 def make_two_agents_config() -> MapFusionConfig:
     """Return the default configuration, but publish nothing that fewer than two agents detected, except by a surveyed pole."""
-    config = MapFusionConfig()
-    evidence = replace(config.stations.evidence, min_publish_agents=2)
-    return replace(config, stations=replace(config.stations, evidence=evidence))
+    return _with_evidence(min_publish_agents=2)
 
 
 def make_map_model_config() -> MapFusionConfig:
     """Return the configuration for observations of our map models: they detect fewer lines, and score those lower, than agents of
     the simulated fleets, whose errors the defaults describe. Chosen on Town07.
     """
+    return _with_evidence(detection_prob=0.5, score_low=0.2, score_high=0.5)
+
+
+def _with_evidence(**changes: float) -> MapFusionConfig:
+    """Return the default configuration with fields of its EvidenceConfig replaced."""
     config = MapFusionConfig()
-    evidence = replace(config.stations.evidence, detection_prob=0.5, score_low=0.2, score_high=0.5)
+    evidence = replace(config.stations.evidence, **changes)
     return replace(config, stations=replace(config.stations, evidence=evidence))
 
 
