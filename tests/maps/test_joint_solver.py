@@ -175,6 +175,27 @@ def test_pairs_equal_stations_as_unknowns():
     np.testing.assert_allclose(found.increment[:, [0, 2]], 0.0, atol=1e-9)
 
 
+def test_a_crowd_around_every_point_equals_the_sum_by_hand():
+    """A thousand points lie around each of 200 observations of the same lines; only those beside it count."""
+    rng = np.random.default_rng(5)
+    seen = [
+        make_observation((0.0, 0.0, 0.0), f"a{k}", k, (0.0, y, 0.0), noise=0.0, turned=False)
+        for k, y in enumerate(rng.uniform(-0.4, 0.4, 200))
+    ]
+    arrays, widths = to_observation_arrays(seen, CONFIG.spacing_m), JointIteration(2.0, 0.8, 9.0)
+    state, rows = make_initial_solution(arrays), np.arange(len(seen))
+    part = pose_optimization._sum_home_pairs(arrays, state, np.arange(len(arrays.xy)), widths, rows, CONFIG)
+    assert part.pairs is not None
+    y = part.pose[:, 1]
+    kernel = (0.64 / (0.64 + (y[:, None] - y) ** 2)) ** 2 * (1.0 - np.eye(len(y)))
+    unit = 1.0 / (CONFIG.points_per_independent * (CONFIG.sigma_m**2 + float(arrays.sigma[0]) ** 2))
+    points = len(arrays.xy) / len(seen)
+    np.testing.assert_allclose(
+        part.pairs.own[:, 3], points * unit * 0.5 * kernel.sum(1) / (1.0 + kernel.sum(1)), rtol=1e-9
+    )
+    assert (np.diff(part.pairs.offsets) == len(seen) - 1).all()
+
+
 def test_iterations_equal_factors(crossroads):
     _, _, blocks, priors = make_problem(crossroads, JointIteration(2.0, 0.8, 9.0))
     direct, iterated = solve_joint_step(blocks, priors, 9.0), solve_joint_step(blocks, priors, 9.0, 1e-9)

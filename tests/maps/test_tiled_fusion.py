@@ -15,8 +15,9 @@ from manyeyes.maps.fusion.fuse import MapFusionConfig, fuse
 from manyeyes.maps.fusion.observation_arrays import to_observation_arrays
 from manyeyes.maps.fusion.polyline_linking import LinkConfig
 from manyeyes.maps.fusion.pose_config import PoseSolverConfig
-from manyeyes.maps.fusion.pose_optimization import list_domains, solve_poses
-from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT
+from manyeyes.maps.fusion.pose_optimization import limit_per_cell, list_domains, solve_poses
+from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT, make_initial_solution
+from manyeyes.maps.store import tiled_fusion
 from manyeyes.maps.store.executors import InlineExecutor, make_executor
 from manyeyes.maps.store.log_index import IndexRow, LogIndex
 from manyeyes.maps.store.object_store import FolderStore
@@ -158,6 +159,31 @@ def test_finished_steps_are_found_again_and_a_damaged_one_is_done_again(store, w
     assert _tiled(store, work, 256.0).quantised_hash() == whole.quantised_hash()
     after = {key: (work / key).stat().st_mtime_ns for key in objects.list("work")}
     assert {key for key in before if after[key] != before[key]} == set(stations[:2]) and after.keys() == before.keys()
+
+
+def test_which_points_count_is_computed_once_a_search_and_again_where_it_is_damaged(store, tmp_path, monkeypatch):
+    arrays = to_observation_arrays(read_active(store.objects, store.log.active_observations(), np.arange(COUNT)), 1.0)
+    state = make_initial_solution(arrays)
+    moved = replace(state, initial_pose=state.initial_pose + [50.0, 0.0, 0.3])
+    calls = []
+
+    def count_calls(*given):
+        calls.append(given)
+        return limit_per_cell(*given)
+
+    monkeypatch.setattr(tiled_fusion, "limit_per_cell", count_calls)
+    config = replace(MapFusionConfig(), pose_solver=PoseSolverConfig(max_observations_per_cell=2))
+    work = FolderStore(tmp_path / "work")
+    task = tiled_fusion.StepTask(FusionJob(store.objects, work, config), "pairs", (0, 0), 3, ())
+    want = limit_per_cell(arrays, state.initial_pose[state.row_indices(arrays.ids)], 2)
+    for one in (task, replace(task, number=4)):
+        np.testing.assert_array_equal(tiled_fusion._load_limit(one, arrays, state), want)
+    assert len(calls) == 1 and 0 < want.sum() < len(want)
+    assert not np.array_equal(tiled_fusion._load_limit(task, arrays, moved), want) and len(calls) == 2
+    for key in work.list("work"):
+        (tmp_path / "work" / key).write_bytes(b"damaged")
+    np.testing.assert_array_equal(tiled_fusion._load_limit(task, arrays, state), want)
+    assert len(calls) == 3
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array, coo_array, csc_array
+from scipy.sparse import bsr_array
 from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 
 from manyeyes._jit import F64x1, F64x3, I64x1, njit
@@ -136,7 +136,9 @@ def solve_joint_step(pairs: PairBlocks, priors: JointPriors, scale: float, toler
     system, right_side = assemble_joint_system(pairs, priors, own_weight, drive_weight)
     factor = None
     if tolerance is None:
-        factor = splu(system, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        factor = splu(
+            system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
         found = factor.solve(right_side)
     else:
         found = _solve_iteratively(system, right_side, tolerance)
@@ -144,24 +146,23 @@ def solve_joint_step(pairs: PairBlocks, priors: JointPriors, scale: float, toler
     return JointStep(found[:count].reshape(-1, 3), found[count:].reshape(-1, 3), own_weight, factor)
 
 
-def _solve_iteratively(system: csc_array, right_side: Floats, tolerance: float) -> Floats:
+def _solve_iteratively(system: bsr_array, right_side: Floats, tolerance: float) -> Floats:
     """Solve by conjugate gradients with the blocks on the diagonal as preconditioner."""
-    blocks = bsr_array(system, blocksize=(3, 3))
-    size = len(blocks.indptr) - 1
-    on_diagonal = np.repeat(np.arange(size), np.diff(blocks.indptr)) == blocks.indices
-    inverse = np.linalg.inv(blocks.data[on_diagonal])
+    size = len(system.indptr) - 1
+    on_diagonal = np.repeat(np.arange(size), np.diff(system.indptr)) == system.indices
+    inverse = np.linalg.inv(system.data[on_diagonal])
 
     def precondition(vector: Floats) -> Floats:
         return np.einsum("nij,nj->ni", inverse, vector.reshape(-1, 3)).reshape(-1)
 
-    return cg(blocks, right_side, rtol=tolerance, maxiter=MAX_ITERATIONS, M=LinearOperator(system.shape, precondition))[
+    return cg(system, right_side, rtol=tolerance, maxiter=MAX_ITERATIONS, M=LinearOperator(system.shape, precondition))[
         0
     ]
 
 
 def assemble_joint_system(
     pairs: PairBlocks, priors: JointPriors, own_weight: Floats, drive_weight: Floats
-) -> tuple[csc_array, Floats]:
+) -> tuple[bsr_array, Floats]:
     """Assemble the normal equations: the increments of O poses first, then S biases, three unknowns each."""
     chain, count, states = priors.chain, len(priors.correction), len(priors.chain.previous)
     rows, state = np.arange(count), count + chain.state
@@ -189,15 +190,16 @@ def assemble_joint_system(
     return system, right_side.reshape(-1)
 
 
-def bsr_from_blocks(families: list[tuple[Ints, Ints, Floats]], size: int) -> csc_array:
-    """Sum blocks (N, 3, 3) at block rows and columns (N,) into a sparse matrix of 3 size rows."""
-    row = np.concatenate([f[0] for f in families])
-    column = np.concatenate([f[1] for f in families])
+def bsr_from_blocks(families: list[tuple[Ints, Ints, Floats]], size: int) -> bsr_array:
+    """Sum blocks (N, 3, 3) at block rows and columns (N,) into a sparse matrix of 3 size rows, those of one place in order."""
+    place = np.concatenate([row * size + column for row, column, _ in families])
     block = np.concatenate([f[2] for f in families])
-    three = np.arange(3)
-    i = np.broadcast_to(3 * row[:, None, None] + three[:, None], block.shape)
-    j = np.broadcast_to(3 * column[:, None, None] + three[None, :], block.shape)
-    return coo_array((block.ravel(), (i.ravel(), j.ravel())), shape=(3 * size, 3 * size)).tocsc()
+    order = np.argsort(place, kind="stable")
+    place = place[order]
+    begins = np.flatnonzero(np.concatenate((np.ones(min(1, len(place)), bool), place[1:] != place[:-1])))
+    row, column = np.divmod(place[begins], size)
+    offsets = np.concatenate(([0], np.cumsum(np.bincount(row, minlength=size))))
+    return bsr_array((np.add.reduceat(block[order], begins), column, offsets), shape=(3 * size, 3 * size))
 
 
 def compute_marginal_covariance(factor: SuperLU, count: int) -> Floats:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from manyeyes._jit import F64x1, F64x2, I64x1, njit, set_row, set_rows
-from manyeyes.maps.fusion.point_grid import find_cell_range, line_residual
+from manyeyes.maps.fusion.point_grid import find_cell_range
 from manyeyes.ops._sort_kernels import sort
 
 Floats = NDArray[np.float64]
@@ -73,34 +73,34 @@ def sum_pairs(
         the lines move the observation, and no other by it.
     """
     first, xy, sigma = own_points.offsets, own_points.xy, own_points.sigma
-    gate, reach, c2 = limits.gate_m, limits.max_longitudinal_m, limits.kernel_m**2
-    far = gate * gate + reach * reach
-    radius, stride = np.sqrt(far), limits.point_stride
+    radius, stride = np.sqrt(limits.gate_m**2 + limits.max_longitudinal_m**2), limits.point_stride
     own, offsets = np.zeros((len(home), NUM_OWN)), np.zeros(len(home) + 1, np.int64)
     slot, met = np.full(len(pose), -1), np.empty(len(pose), np.int64)
     sums, alone = np.zeros((len(pose), NUM_SUMS)), np.zeros(NUM_SUMS)
     other, shared, filled = np.empty(64, np.int64), np.empty((64, NUM_SHARED)), 0
-    near, gain = np.empty(256, np.int64), np.empty((256, 4))
+    near, columns = np.empty(256, np.int64), np.empty((5, 256))
     for h in range(len(home)):
         o, n = home[h], 0
         for p in range(first[o], first[o + 1], stride):
-            found, total, gain, near = _find_members(
-                p, o, radius, c2, own_points, other_points, limits, weight, gain, near
-            )
+            near, columns, found = _gather_near(p, o, radius, own_points, other_points, weight, near, columns)
+            _weigh_near(found, own_points.tangent[p, 0], own_points.tangent[p, 1], limits, columns)
+            found, total = _keep_members(found, near, columns)
             if found == 0:
                 continue
+            residual, mean_x, mean_y, member_weight = columns[0], columns[2], columns[3], columns[4]
             mine = max(weight[o], 1e-9)
+            # The other point's residual about the same station is the second half of the pair.
+            half = 0.5 * mine if weight[o] > 0.0 else 1.0
             unit = stride / (limits.points_per_independent * (sigma[p] * sigma[p] + limits.sigma_m * limits.sigma_m))
             x, y = xy[p, 0] - pose[o, 0], xy[p, 1] - pose[o, 1]
             square = 0.0
             for m in range(found):
-                q, w, r = near[m], gain[m, 0], gain[m, 1]
-                jx, jy = -gain[m, 3], gain[m, 2]
+                q, w, r = near[m], member_weight[m], residual[m]
+                jx, jy = -mean_y[m], mean_x[m]
                 jt = jy * x - jx * y
                 j = other_points.observation[q]
-                # The other point's residual about the same station is the second half of the pair.
-                w = unit * w / (mine + total) * (0.5 * mine if weight[o] > 0.0 else 1.0)
-                square += gain[m, 0] * r * r
+                square += w * r * r
+                w = unit * w / (mine + total) * half
                 if weight[o] <= 0.0:
                     _add_pair(alone, w, (jx, jy, jt), 0.0, r)
                     continue
@@ -194,53 +194,69 @@ def _set_shared(shared: F64x1, row: F64x1) -> None:  # pragma: no cover - compil
     shared[17] = -row[11]
 
 
-@njit(cache=True, nogil=True)
-def _find_members(
+@njit(cache=True, nogil=True, error_model="numpy")
+def _gather_near(
     p: int,
     o: int,
     radius: float,
-    c2: float,
     own_points: OwnPoints,
     other_points: OtherPoints,
-    limits: PairLimits,
     weight: F64x1,
-    gain: F64x2,
     near: I64x1,
-) -> tuple[int, float, F64x2, I64x1]:  # pragma: no cover - compiled
-    """Find the members of the station of point p: their number, sum of weights, (weight, residual, mean tangent) and points."""
-    x, y = own_points.xy[p, 0], own_points.xy[p, 1]
-    u, v, kind = own_points.tangent[p, 0], own_points.tangent[p, 1], own_points.kind[p]
-    cell = other_points.cell_m
+    columns: F64x2,
+) -> tuple[I64x1, F64x2, int]:  # pragma: no cover - compiled
+    """Gather the points of other observations with a weight around point p: which, (dx, dy, tangent, weight) and their number."""
+    x, y, kind = own_points.xy[p, 0], own_points.xy[p, 1], own_points.kind[p]
+    cell, square = other_points.cell_m, radius * radius
     low_y, high_y = int(np.floor((y - radius) / cell)), int(np.floor((y + radius) / cell))
-    found, total = 0, 0.0
+    n = 0
     for ix in range(int(np.floor((x - radius) / cell)), int(np.floor((x + radius) / cell)) + 1):
         low, high = find_cell_range(other_points.keys, other_points.offsets, kind, ix, low_y, high_y)
+        while n + high - low > len(near):
+            near, columns = _longer(near), _wider(columns)
+        dx, dy, tangent_x, tangent_y, weights = columns[0], columns[1], columns[2], columns[3], columns[4]
         for q in range(low, high):
             j = other_points.observation[q]
-            if j == o or weight[j] <= 0.0:
-                continue
-            ex, ey = other_points.xy[q, 0] - x, other_points.xy[q, 1] - y
-            if ex * ex + ey * ey > radius * radius:
-                continue
-            s, t = other_points.tangent[q, 0], other_points.tangent[q, 1]
-            along, aside = line_residual(ex, ey, u, v, s, t, limits.min_cosine)
-            if abs(along) > limits.max_longitudinal_m or abs(aside) > limits.gate_m:
-                continue
-            g = c2 / (c2 + aside * aside)
-            w = weight[j] * g * g * (1.0 - abs(along) / limits.max_longitudinal_m)
-            if w <= 0.0:
-                continue
-            if found == len(near):
-                near, gain = _longer(near), _taller(gain)
-            dot = u * s + v * t
-            sign = 1.0 if dot > 0.0 else -1.0
-            norm = np.sqrt(2.0 + 2.0 * abs(dot))
-            near[found] = q
-            gain[found, 0], gain[found, 1] = w, aside
-            gain[found, 2], gain[found, 3] = (u + sign * s) / norm, (v + sign * t) / norm
-            total += w
-            found += 1
-    return found, float(total), gain, near
+            ex, ey, w = other_points.xy[q, 0] - x, other_points.xy[q, 1] - y, weight[j]
+            near[n], dx[n], dy[n], weights[n] = q, ex, ey, w
+            tangent_x[n], tangent_y[n] = other_points.tangent[q, 0], other_points.tangent[q, 1]
+            # A point that does not count is overwritten by the next one, which is faster than a branch.
+            n += 1 if (ex * ex + ey * ey <= square) & (j != o) & (w > 0.0) else 0
+    return near, columns, n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _weigh_near(n: int, u: float, v: float, limits: PairLimits, columns: F64x2) -> None:  # pragma: no cover - compiled
+    """Replace columns of the points around one with tangent (u, v): residual for dx, mean tangent, weight as a member.
+
+    The same as :func:`~manyeyes.maps.fusion.point_grid.line_residual`, without branches, so that the loop is vectorised.
+    """
+    dx, dy, tangent_x, tangent_y, weight = columns[0], columns[1], columns[2], columns[3], columns[4]
+    gate, reach, min_cosine, c2 = limits.gate_m, limits.max_longitudinal_m, limits.min_cosine, limits.kernel_m**2
+    for k in range(n):
+        dot = u * tangent_x[k] + v * tangent_y[k]
+        sign = 1.0 if dot > 0.0 else -1.0
+        norm = np.sqrt(2.0 + 2.0 * abs(dot))
+        mx, my = (u + sign * tangent_x[k]) / norm, (v + sign * tangent_y[k]) / norm
+        along, aside = dx[k] * mx + dy[k] * my, dy[k] * mx - dx[k] * my
+        g = c2 / (c2 + aside * aside)
+        w = weight[k] * g * g * (1.0 - abs(along) / reach)
+        weight[k] = w if (abs(dot) >= min_cosine) & (abs(along) <= reach) & (abs(aside) <= gate) else 0.0
+        dx[k], tangent_x[k], tangent_y[k] = aside, mx, my
+
+
+@njit(cache=True, nogil=True)
+def _keep_members(n: int, near: I64x1, columns: F64x2) -> tuple[int, float]:  # pragma: no cover - compiled
+    """Keep the points with a weight, in order: their number and sum of weights."""
+    residual, mean_x, mean_y, weight = columns[0], columns[2], columns[3], columns[4]
+    found, total = 0, 0.0
+    for k in range(n):
+        w = weight[k]
+        near[found], residual[found], weight[found] = near[k], residual[k], w
+        mean_x[found], mean_y[found] = mean_x[k], mean_y[k]
+        total += w
+        found += 1 if w > 0.0 else 0
+    return found, float(total)
 
 
 @njit(cache=True, nogil=True)
@@ -254,4 +270,11 @@ def _longer(rows: I64x1) -> I64x1:  # pragma: no cover - compiled
 def _taller(rows: F64x2) -> F64x2:  # pragma: no cover - compiled
     bigger = np.empty((2 * len(rows), rows.shape[1]))
     set_rows(bigger[: len(rows)], rows)
+    return bigger
+
+
+@njit(cache=True, nogil=True)
+def _wider(columns: F64x2) -> F64x2:  # pragma: no cover - compiled
+    bigger = np.empty((columns.shape[0], 2 * columns.shape[1]))
+    set_rows(bigger[:, : columns.shape[1]], columns)
     return bigger

@@ -34,6 +34,7 @@ from manyeyes.maps.fusion.fuse import MapFusionConfig
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays, to_observation_arrays
 from manyeyes.maps.fusion.pose_optimization import (
     find_domain_area,
+    limit_per_cell,
     list_domains,
     run_step,
     search_coarse_poses,
@@ -160,6 +161,13 @@ class FusionStepResult:
 
     keys: tuple[str, ...]
     failures: tuple[FailedObservation, ...] = ()
+
+
+@dataclass(frozen=True)
+class _PointLimit:
+    """keep: (P,) points of a block that count, :func:`~manyeyes.maps.fusion.pose_optimization.limit_per_cell`."""
+
+    keep: NDArray[np.bool_]
 
 
 class LostResultError(StoreError):
@@ -474,7 +482,8 @@ def _compute_block(
     if task.kind == "search":
         return {"poses": search_coarse_poses(arrays, home, config.pose_solver)}
     state = apply_agents(make_initial_solution(arrays), table) if solution is None else solution
-    return {"poses": run_step(arrays, state, task.number, home, config.pose_solver)}
+    keep = None if task.kind == "repeat" else _load_limit(task, arrays, state)
+    return {"poses": run_step(arrays, state, task.number, home, config.pose_solver, keep)}
 
 
 def _isolate_block(
@@ -509,6 +518,23 @@ def _load_arrays(task: StepTask, block: TileBlock) -> ObservationArrays:
         found = to_observation_arrays(observations, job.config.pose_solver.spacing_m)
         job.work.put(key, pack_record(found), durable=False)
     return found
+
+
+def _load_limit(task: StepTask, arrays: ObservationArrays, state: PoseSolution) -> NDArray[np.bool_]:
+    """Load which points (P,) count at the initial poses, which only a search changes, or compute and store it."""
+    work, config = task.job.work, task.job.config.pose_solver
+    initial = np.ascontiguousarray(state.initial_pose[state.row_indices(arrays.ids)])
+    digest = hashlib.blake2b(initial.tobytes(), digest_size=16)
+    digest.update(repr((_code(), arrays.ids, task.job.config)).encode())
+    key = f"{_arrays_folder(task.place)}/{digest.hexdigest()}.limit"
+    try:
+        found = unpack_record(work.get(key), _PointLimit)
+    except ObjectNotFoundError:
+        found = None
+    if found is None:
+        found = _PointLimit(limit_per_cell(arrays, initial, config.max_observations_per_cell))
+        work.put(key, pack_record(found), durable=False)
+    return found.keep
 
 
 def _arrays_folder(place: Place) -> str:
