@@ -13,7 +13,9 @@ pytest.importorskip("shapely", reason="the 'map' extra is not installed")
 
 from manyeyes.cli import main as cli
 from manyeyes.maps.elements.observation_file import read_observations
+from manyeyes.maps.fusion.fuse import MapFusionConfig
 from manyeyes.maps.registry import OURS, TWO_AGENTS
+from manyeyes.maps.store.store import MapStore
 from manyeyes.studies.map_folder import read_vector_map
 
 
@@ -118,10 +120,21 @@ def test_a_store_may_require_two_agents_also_after_a_retraction(tmp_path, capsys
         counts.append(len(read_vector_map(store).select_published()))
     assert counts[0] > counts[1]
     agent = read_observations(drive / "observations").observations[0].agent
-    words = ("--agent", agent, "--reason", "test", "--executor", "inline", "--method", TWO_AGENTS)
+    words = ("--agent", agent, "--reason", "test", "--executor", "inline")
     assert run("map", "retract", store, *words) == 0
     kept = read_vector_map(store).select_published()
     assert len(kept) <= counts[1] and (kept.agents >= 2).all()
+    # A release of other settings, as of an earlier version, has no method by that name.
+    manifest = max(Path(store).glob("releases/*.json"))
+    release = json.loads(manifest.read_text())
+    manifest.write_text(json.dumps({**release, "settings": "MapFusionConfig(old=1)"}))
+    rest = read_observations(drive / "observations").observations[-1].agent
+    words = ("--agent", rest, "--reason", "test", "--executor", "inline")
+    capsys.readouterr()
+    assert run("map", "retract", store, *words) == 1
+    assert "release 3 was made with other settings" in capsys.readouterr().err
+    assert run("map", "retract", store, *words, "--method", OURS) == 0
+    assert MapStore(store).manifest().settings == repr(MapFusionConfig())
 
 
 @pytest.mark.slow

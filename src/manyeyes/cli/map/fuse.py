@@ -162,6 +162,27 @@ def make_store_config(method: str) -> MapFusionConfig:
     return MAP_FUSION_METHODS.get(method).config_class()
 
 
+def find_store_config(store: MapStore) -> MapFusionConfig:
+    """Return the configuration of the last release of a store, that of manyeyes where there is none.
+
+    Raises:
+        ConfigError: the release was made with another configuration than those of the registered methods.
+    """
+    from manyeyes.maps.registry import MAP_FUSION_METHODS, OURS, VARIANTS
+
+    if not store.releases():
+        return make_store_config(OURS)
+    last = store.manifest()
+    for name in (OURS, *VARIANTS):
+        config = MAP_FUSION_METHODS.get(name).config_class()
+        if repr(config) == last.settings:
+            return config
+    raise ConfigError(
+        f"{store.objects.location}: release {last.number} was made with other settings than those of this version's "
+        f"{', '.join((OURS, *VARIANTS))}; say with --method which of them makes the next one."
+    )
+
+
 def publish_release(store: MapStore, config: MapFusionConfig, executor: Executor, console: Console) -> int:
     """Fuse all observations of a store that count, publish the map, and return the release's number."""
     from manyeyes.viz.progress import make_progress_bars

@@ -30,8 +30,8 @@ class Options:
     """Instead of ids: all observations of this pass; with --agent, only that agent's."""
     fuse: bool = True
     """Fuse and publish a release at once; else the next fusion leaves them out."""
-    method: str = "manyeyes"
-    """The method of the release: manyeyes, or the variant that 'map fuse --store' was called with."""
+    method: str | None = None
+    """The method of the new release: manyeyes or a variant of it; by default that of the last release."""
     executor: str = "process"
     """What fuses the tiles: inline, process, dask or ray."""
     workers: WorkerCount | None = None
@@ -44,7 +44,7 @@ def main(options: Options) -> None:
     """Remove observations of a store and publish the map."""
     from rich.console import Console
 
-    from manyeyes.cli.map.fuse import make_store_config, publish_release
+    from manyeyes.cli.map.fuse import find_store_config, make_store_config, publish_release
     from manyeyes.maps.store.executors import make_executor
     from manyeyes.maps.store.store import compute_watermark
     from manyeyes.studies.map_folder import open_store, report_rejected
@@ -54,9 +54,11 @@ def main(options: Options) -> None:
         raise ConfigError("Name the observations: --ids ID ..., or --agent NAME, --pass-id NAME or both.")
     if not options.reason.strip():
         raise ConfigError("--reason is empty; the log records why observations are retracted.")
-    config = make_store_config(options.method)
     executor = make_executor(options.executor, options.workers, options.address)
     store, console = open_store(options.store), Console()
+    config = None
+    if options.fuse:
+        config = find_store_config(store) if options.method is None else make_store_config(options.method)
 
     def print_status(text: str) -> None:
         console.print(f"{options.store}: {text}", highlight=False, markup=False, soft_wrap=True)
@@ -70,7 +72,7 @@ def main(options: Options) -> None:
     last = store.manifest() if store.releases() else None
     if last is not None and last.watermark == compute_watermark(active.ids, active.time_ns):
         print_status(f"release {last.number} is already without them")
-    elif options.fuse:
+    elif config is not None:
         known = len(log.rejected)
         print_status(f"release {publish_release(store, config, executor, console)} is without them")
         report_rejected(log.rejected[known:], console)
