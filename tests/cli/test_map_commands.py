@@ -133,7 +133,11 @@ def test_a_store_may_require_two_agents_also_after_a_retraction(tmp_path, capsys
     capsys.readouterr()
     assert run("map", "retract", store, *words) == 1
     assert "release 3 was made with other settings" in capsys.readouterr().err
+    assert run("map", "retract", store, *words, "--no-fuse", "--method", "union") == 1
+    assert "A store is fused by" in capsys.readouterr().err
+    # Both were refused before anything was retracted.
     assert run("map", "retract", store, *words, "--method", OURS) == 0
+    assert "retracted now, 0 before" in capsys.readouterr().out
     assert MapStore(store).manifest().settings == repr(MapFusionConfig())
 
 

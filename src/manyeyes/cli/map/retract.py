@@ -57,8 +57,10 @@ def main(options: Options) -> None:
     executor = make_executor(options.executor, options.workers, options.address)
     store, console = open_store(options.store), Console()
     config = None
-    if options.fuse:
-        config = find_store_config(store) if options.method is None else make_store_config(options.method)
+    if options.method is not None:
+        config = make_store_config(options.method)
+    elif options.fuse:
+        config = find_store_config(store)
 
     def print_status(text: str) -> None:
         console.print(f"{options.store}: {text}", highlight=False, markup=False, soft_wrap=True)
@@ -72,7 +74,7 @@ def main(options: Options) -> None:
     last = store.manifest() if store.releases() else None
     if last is not None and last.watermark == compute_watermark(active.ids, active.time_ns):
         print_status(f"release {last.number} is already without them")
-    elif config is not None:
+    elif options.fuse and config is not None:
         known = len(log.rejected)
         print_status(f"release {publish_release(store, config, executor, console)} is without them")
         report_rejected(log.rejected[known:], console)
