@@ -23,6 +23,7 @@ from manyeyes.maps.fusion.joint_solver import (
     solve_joint_step,
 )
 from manyeyes.maps.fusion.observation_arrays import to_observation_arrays
+from manyeyes.maps.fusion.pair_blocks import PairBlocks
 from manyeyes.maps.fusion.pose_config import JointIteration, PoseSolverConfig
 from manyeyes.maps.fusion.pose_optimization import solve_poses
 from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT, make_initial_solution
@@ -56,7 +57,7 @@ def make_problem(observations, widths, config=CONFIG):
     keep = np.arange(len(arrays.xy))
     part = pose_optimization._sum_home_pairs(arrays, state, keep, widths, np.arange(len(arrays)), config)
     assert part.pairs is not None
-    blocks = pose_optimization._assemble_blocks(part.pairs, part.ids)
+    blocks = PairBlocks.of_sums(part.pairs, part.ids)
     return arrays, state, blocks, pose_optimization._make_priors(state, config)
 
 
@@ -206,7 +207,7 @@ def test_iterations_equal_factors(crossroads):
 
 def test_marginal_covariance_equals_the_dense_inverse(crossroads):
     _, _, blocks, priors = make_problem(crossroads, JointIteration(2.0, 0.8, 9.0))
-    system, _ = assemble_joint_system(blocks, priors, *compute_prior_weights(priors, 9.0))
+    system = assemble_joint_system(blocks, priors, *compute_prior_weights(priors, 9.0)).to_matrix()
     dense = np.linalg.inv(system.toarray())
     found = compute_marginal_covariance(solve_joint_step(blocks, priors, 9.0).factor, len(crossroads))
     for o in range(len(crossroads)):

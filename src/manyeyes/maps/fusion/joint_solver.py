@@ -18,6 +18,7 @@ from scipy.sparse import bsr_array
 from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
 
 from manyeyes._jit import F64x1, F64x3, I64x1, njit
+from manyeyes.maps.fusion.pair_blocks import PairBlocks
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -60,19 +61,6 @@ def make_drive_chain(
         previous[1:] = np.where(linked, np.arange(len(name) - 1), -1)
         ratio[1:] = np.where(linked, np.maximum(gap, 1.0) / drift_length_m, 0.0)
     return DriveChain(state, previous, ratio)
-
-
-@dataclass(frozen=True, eq=False)
-class PairBlocks:
-    """Sums of all pairs over O observations: own (O, 3, 3) and right side (O, 3), and N couplings between rows a and b, each block
-    (N, 3, 3) standing at (a, b) and transposed at (b, a).
-    """
-
-    own: Floats
-    right_side: Floats
-    a: Ints
-    b: Ints
-    coupling: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,37 +121,64 @@ def solve_joint_step(pairs: PairBlocks, priors: JointPriors, scale: float, toler
     tolerance: relative residual of conjugate gradients, whose cost grows in proportion to the observations; None: by factors.
     """
     own_weight, drive_weight = compute_prior_weights(priors, scale)
-    system, right_side = assemble_joint_system(pairs, priors, own_weight, drive_weight)
+    system = assemble_joint_system(pairs, priors, own_weight, drive_weight)
     factor = None
     if tolerance is None:
         factor = splu(
-            system.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+            system.to_matrix().tocsc(),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
         )
-        found = factor.solve(right_side)
+        found = factor.solve(system.right_side)
     else:
-        found = _solve_iteratively(system, right_side, tolerance)
+        found = _solve_iteratively(system, tolerance)
     count = 3 * len(priors.correction)
     return JointStep(found[:count].reshape(-1, 3), found[count:].reshape(-1, 3), own_weight, factor)
 
 
-def _solve_iteratively(system: bsr_array, right_side: Floats, tolerance: float) -> Floats:
+def _solve_iteratively(system: JointSystem, tolerance: float) -> Floats:
     """Solve by conjugate gradients with the blocks on the diagonal as preconditioner."""
-    size = len(system.indptr) - 1
-    on_diagonal = np.repeat(np.arange(size), np.diff(system.indptr)) == system.indices
-    inverse = np.linalg.inv(system.data[on_diagonal])
+    apart = system.apart
+    on_diagonal = np.repeat(np.arange(len(apart.indptr) - 1), np.diff(apart.indptr)) == apart.indices
+    inverse = np.linalg.inv(apart.data[on_diagonal])
 
     def precondition(vector: Floats) -> Floats:
         return np.einsum("nij,nj->ni", inverse, vector.reshape(-1, 3)).reshape(-1)
 
-    return cg(system, right_side, rtol=tolerance, maxiter=MAX_ITERATIONS, M=LinearOperator(system.shape, precondition))[
-        0
-    ]
+    multiply, preconditioner = (LinearOperator(apart.shape, one) for one in (system.multiply, precondition))
+    return cg(multiply, system.right_side, rtol=tolerance, maxiter=MAX_ITERATIONS, M=preconditioner)[0]
+
+
+@dataclass(frozen=True, eq=False)
+class JointSystem:
+    """Normal equations: the increments of O poses first, then S biases, three unknowns each.
+
+    apart: the matrix without the couplings between observations, which pairs holds. right_side: (3 (O + S),).
+    """
+
+    apart: bsr_array
+    pairs: PairBlocks
+    right_side: Floats
+
+    def multiply(self, vector: Floats) -> Floats:
+        """Multiply the matrix by a vector (3 (O + S),)."""
+        out, coupled = self.apart @ vector, 3 * len(self.pairs.own)
+        out[:coupled] += self.pairs.multiply(vector[:coupled].reshape(-1, 3)).reshape(-1)
+        return out
+
+    def to_matrix(self) -> bsr_array:
+        """Return the whole matrix."""
+        row, other, coupling = self.pairs.row, self.pairs.other, self.pairs.coupling
+        size = len(self.right_side) // 3
+        both = [(row, other, coupling), (other, row, coupling.transpose(0, 2, 1))]
+        return self.apart + bsr_from_blocks(both, size)
 
 
 def assemble_joint_system(
     pairs: PairBlocks, priors: JointPriors, own_weight: Floats, drive_weight: Floats
-) -> tuple[bsr_array, Floats]:
-    """Assemble the normal equations: the increments of O poses first, then S biases, three unknowns each."""
+) -> JointSystem:
+    """Assemble the normal equations of a step."""
     chain, count, states = priors.chain, len(priors.correction), len(priors.chain.previous)
     rows, state = np.arange(count), count + chain.state
     own_information = np.linalg.inv((1.0 - priors.bias_fraction) * priors.covariance)
@@ -177,17 +192,15 @@ def assemble_joint_system(
     hold = np.where(priors.fixed, 1e12, 0.0)[:, None, None] * np.eye(3)
     # Row, column and sign of each family of blocks.
     families = [
-        (rows, rows, pairs.own + own + hold), (pairs.a, pairs.b, pairs.coupling),
-        (pairs.b, pairs.a, pairs.coupling.transpose(0, 2, 1)),
-        (rows, state, -own), (state, rows, -own), (state, state, own),
+        (rows, rows, pairs.own + own + hold), (rows, state, -own), (state, rows, -own), (state, state, own),
         (at, at, start), (after, after, step), (before, before, step), (before, after, -step), (after, before, -step),
     ]  # fmt: skip
-    system = bsr_from_blocks(families, count + states)
+    apart = bsr_from_blocks(families, count + states)
     pull = np.einsum("oij,oj->oi", own, priors.correction)
     right_side = np.zeros((count + states, 3))
     right_side[:count] = np.where(priors.fixed[:, None], 0.0, pairs.right_side - pull)
     np.add.at(right_side, state, pull)
-    return system, right_side.reshape(-1)
+    return JointSystem(apart, pairs, right_side.reshape(-1))
 
 
 def bsr_from_blocks(families: list[tuple[Ints, Ints, Floats]], size: int) -> bsr_array:

@@ -73,7 +73,7 @@ def sum_pairs(
         the lines move the observation, and no other by it.
     """
     first, xy, sigma = own_points.offsets, own_points.xy, own_points.sigma
-    radius, stride = np.sqrt(limits.gate_m**2 + limits.max_longitudinal_m**2), limits.point_stride
+    stride = limits.point_stride
     own, offsets = np.zeros((len(home), NUM_OWN)), np.zeros(len(home) + 1, np.int64)
     slot, met = np.full(len(pose), -1), np.empty(len(pose), np.int64)
     sums, alone = np.zeros((len(pose), NUM_SUMS)), np.zeros(NUM_SUMS)
@@ -82,7 +82,7 @@ def sum_pairs(
     for h in range(len(home)):
         o, n = home[h], 0
         for p in range(first[o], first[o + 1], stride):
-            near, columns, found = _gather_near(p, o, radius, own_points, other_points, weight, near, columns)
+            near, columns, found = _gather_near(p, o, own_points, other_points, weight, limits, near, columns)
             _weigh_near(found, own_points.tangent[p, 0], own_points.tangent[p, 1], limits, columns)
             found, total = _keep_members(found, near, columns)
             if found == 0:
@@ -198,30 +198,41 @@ def _set_shared(shared: F64x1, row: F64x1) -> None:  # pragma: no cover - compil
 def _gather_near(
     p: int,
     o: int,
-    radius: float,
     own_points: OwnPoints,
     other_points: OtherPoints,
     weight: F64x1,
+    limits: PairLimits,
     near: I64x1,
     columns: F64x2,
 ) -> tuple[I64x1, F64x2, int]:  # pragma: no cover - compiled
-    """Gather the points of other observations with a weight around point p: which, (dx, dy, tangent, weight) and their number."""
-    x, y, kind = own_points.xy[p, 0], own_points.xy[p, 1], own_points.kind[p]
-    cell, square = other_points.cell_m, radius * radius
-    low_y, high_y = int(np.floor((y - radius) / cell)), int(np.floor((y + radius) / cell))
+    """Gather the points of other observations around point p: which, (dx, dy, tangent, weight) and their number.
+
+    They lie in a rectangle along the tangent of p that holds all within the gates, which are along a mean of two tangents.
+    """
+    x, y, kind, cell = own_points.xy[p, 0], own_points.xy[p, 1], own_points.kind[p], other_points.cell_m
+    u, v = own_points.tangent[p, 0], own_points.tangent[p, 1]
+    lean = np.sqrt(0.5 * (1.0 - limits.min_cosine))
+    along = (limits.max_longitudinal_m + lean * limits.gate_m) * (1.0 + 1e-9)
+    aside = (limits.gate_m + lean * limits.max_longitudinal_m) * (1.0 + 1e-9)
+    reach_x, reach_y = abs(u) * along + abs(v) * aside, abs(v) * along + abs(u) * aside
+    low_y, high_y = int(np.floor((y - reach_y) / cell)), int(np.floor((y + reach_y) / cell))
     n = 0
-    for ix in range(int(np.floor((x - radius) / cell)), int(np.floor((x + radius) / cell)) + 1):
+    for ix in range(int(np.floor((x - reach_x) / cell)), int(np.floor((x + reach_x) / cell)) + 1):
         low, high = find_cell_range(other_points.keys, other_points.offsets, kind, ix, low_y, high_y)
         while n + high - low > len(near):
             near, columns = _longer(near), _wider(columns)
-        dx, dy, tangent_x, tangent_y, weights = columns[0], columns[1], columns[2], columns[3], columns[4]
         for q in range(low, high):
-            j = other_points.observation[q]
-            ex, ey, w = other_points.xy[q, 0] - x, other_points.xy[q, 1] - y, weight[j]
-            near[n], dx[n], dy[n], weights[n] = q, ex, ey, w
-            tangent_x[n], tangent_y[n] = other_points.tangent[q, 0], other_points.tangent[q, 1]
+            ex, ey = other_points.xy[q, 0] - x, other_points.xy[q, 1] - y
+            near[n] = q
             # A point that does not count is overwritten by the next one, which is faster than a branch.
-            n += 1 if (ex * ex + ey * ey <= square) & (j != o) & (w > 0.0) else 0
+            is_near = (abs(ex * u + ey * v) <= along) & (abs(ey * u - ex * v) <= aside)
+            n += 1 if is_near & (other_points.observation[q] != o) else 0
+    dx, dy, tangent_x, tangent_y, weights = columns[0], columns[1], columns[2], columns[3], columns[4]
+    for k in range(n):
+        q = near[k]
+        dx[k], dy[k] = other_points.xy[q, 0] - x, other_points.xy[q, 1] - y
+        tangent_x[k], tangent_y[k] = other_points.tangent[q, 0], other_points.tangent[q, 1]
+        weights[k] = weight[other_points.observation[q]]
     return near, columns, n
 
 

@@ -42,16 +42,22 @@ from manyeyes.maps.fusion.coarse_search import find_isolated_shifts, search_coar
 from manyeyes.maps.fusion.joint_solver import (
     JointPriors,
     JointStep,
-    PairBlocks,
     compute_marginal_covariance,
     make_drive_chain,
     solve_joint_step,
 )
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays, to_observation_arrays
+from manyeyes.maps.fusion.pair_blocks import PairBlocks
 from manyeyes.maps.fusion.pair_system import OtherPoints, OwnPoints, PairLimits, sum_pairs
 from manyeyes.maps.fusion.point_grid import build_grid, cell_key, limit_observations
 from manyeyes.maps.fusion.pose_config import DEFAULT_ALIGN, JointIteration, PoseSolverConfig, SolverStep
-from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT, PairSums, PoseSolution, make_initial_solution
+from manyeyes.maps.fusion.pose_solution import (
+    REJECTED_WEIGHT,
+    PairSums,
+    PoseSolution,
+    make_initial_solution,
+    take_pairs,
+)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -60,8 +66,7 @@ STEP_TOLERANCE = 1e-5
 """Relative residual of the joint steps but the last; what is left of a step is in the next one."""
 _BOUND_CELL_M = 8.0
 _PAIR_CELL_M = 1.0
-# Of the upper triangle (xx, xy, xt, yy, yt, tt), the entries of a symmetric matrix in order of rows.
-_SYMMETRIC = [0, 1, 2, 1, 3, 4, 2, 4, 5]
+_STRIP_M = 64.0
 
 
 def solve_poses(observations: Sequence[Observation], config: PoseSolverConfig = DEFAULT_ALIGN) -> PoseSolution:
@@ -172,8 +177,10 @@ def _sum_home_pairs(
     weight[np.asarray(arrays.trusted)] = config.surveyed_weight
     grid = build_grid(xy[keep, 0], xy[keep, 1], arrays.kind_of_point[keep], _PAIR_CELL_M)
     order = keep[grid.order]
+    # Neighbours one after the other meet the same points, which then lie in the cache.
+    nearby = np.lexsort((part.pose[:, 0], np.floor(part.pose[:, 1] / _STRIP_M)))
     own, offsets, other, shared = sum_pairs(
-        _rows_in(arrays, part),
+        _rows_in(arrays, part)[nearby],
         pose,
         weight,
         OwnPoints(arrays.observation_offsets, xy, tangent, np.asarray(arrays.kind_of_point), np.asarray(arrays.sigma)),
@@ -195,7 +202,8 @@ def _sum_home_pairs(
             widths.point_stride,
         ),
     )
-    return replace(part, pairs=PairSums(own, offsets, arrays.digests[other], shared))
+    pairs = PairSums(own, offsets, arrays.digests[other], shared)
+    return replace(part, pairs=take_pairs(pairs, np.argsort(nearby)))
 
 
 def merge_solutions(
@@ -240,8 +248,7 @@ def settle_domain(
 
     A pure function of the observations within the halo of the domain, which the disjoint parts together hold.
     """
-    whole = PoseSolution.cat(parts)
-    near = whole.take(_rows_near_domain(whole, domain, config))
+    near = PoseSolution.cat([take_near_domain(part, domain, config) for part in parts])
     home = np.flatnonzero((_domain_indices(near.prior_pose, config) == domain).all(1))
     return _reset_isolated(near, config).take(home)
 
@@ -277,11 +284,17 @@ def solve_domain(
     Returns:
         The observations of the domain, ids ascending, and the sums of their agents.
     """
-    whole = PoseSolution.cat(parts)
-    near = whole.take_with_pairs(_rows_near_domain(whole, domain, config))
+    near = PoseSolution.cat([take_near_domain(part, domain, config) for part in parts])
     if not len(near.ids):
         return near, AgentSums.of((), np.zeros((0, NUM_COLUMNS)))
     return _select_domain(*_solve_near(near, step, config), domain, config)
+
+
+def take_near_domain(
+    part: PoseSolution, domain: tuple[int, int], config: PoseSolverConfig = DEFAULT_ALIGN
+) -> PoseSolution:
+    """Return the observations, with their pairs, that a step of the domain reads."""
+    return part.take_with_pairs(_rows_near_domain(part, domain, config))
 
 
 def _rows_near_domain(whole: PoseSolution, domain: tuple[int, int], config: PoseSolverConfig) -> Ints:
@@ -302,7 +315,7 @@ def _select_domain(
 def _solve_near(near: PoseSolution, step: SolverStep, config: PoseSolverConfig) -> tuple[PoseSolution, Floats]:
     """Solve a joint step for these observations; their state, and what each adds to the sums of its agent (O, 9)."""
     assert step.joint is not None and near.pairs is not None
-    blocks = _assemble_blocks(near.pairs, near.ids)
+    blocks = PairBlocks.of_sums(near.pairs, near.ids)
     priors = _make_priors(near, config)
     # The last step is solved by factors, which give the covariance, too.
     solved = solve_joint_step(blocks, priors, step.joint.prior_scale, None if step.is_last else STEP_TOLERANCE)
@@ -346,21 +359,6 @@ def weigh_agents(
     """Weigh all agents after a joint step."""
     limits = AgentLimits(config.agent_tolerance, config.agent_scale, config.max_agent_error, config.drive_fraction)
     return AgentWeights.of_sums(sums, previous, step.decides, limits)
-
-
-def _assemble_blocks(pairs: PairSums, ids: Sequence[str]) -> PairBlocks:
-    """Assemble the sums of observations, whose ids ascend; others that they form pairs with stay where they are."""
-    # Fixed lengths compare as integers do; ids ascend, so rows are found by bisection.
-    digests = np.ascontiguousarray(pairs.other_ids).view("S16").ravel()
-    known = np.frombuffer(bytes.fromhex("".join(ids)), "S16")
-    b = np.searchsorted(known, digests)
-    inside = known[np.minimum(b, len(known) - 1)] == digests
-    a = np.repeat(np.arange(len(ids)), np.diff(pairs.offsets))[inside]
-    b, shared = b[inside], pairs.shared[inside]
-    own, right_side = pairs.own[:, _SYMMETRIC].reshape(-1, 3, 3), pairs.own[:, 6:9].copy()
-    np.add.at(own, b, shared[:, 9:15][:, _SYMMETRIC].reshape(-1, 3, 3))
-    np.add.at(right_side, b, shared[:, 15:18])
-    return PairBlocks(own, right_side, a, b, shared[:, :9].reshape(-1, 3, 3))
 
 
 def _make_priors(whole: PoseSolution, config: PoseSolverConfig) -> JointPriors:

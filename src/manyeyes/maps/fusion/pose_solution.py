@@ -90,7 +90,9 @@ class PoseSolution:
 
     def take_with_pairs(self, rows: Ints) -> PoseSolution:
         """Return the chosen rows with their pairs, also those with observations that are left out."""
-        return replace(self.take(rows), pairs=None if self.pairs is None else _take_pairs(self.pairs, rows))
+        if np.array_equal(rows, np.arange(len(self.ids))):
+            return self
+        return replace(self.take(rows), pairs=None if self.pairs is None else take_pairs(self.pairs, rows))
 
     def with_agents(self, agent_error: Floats, agent_weight: Floats, scale: Floats) -> PoseSolution:
         """Return the same with the error, the weight and the residual scale (O,) of each observation's agent."""
@@ -99,14 +101,15 @@ class PoseSolution:
     @classmethod
     def cat(cls, parts: Sequence[PoseSolution]) -> PoseSolution:
         """Concatenate disjoint parts, ids ascending, with their pairs if all have them."""
+        if len(parts) == 1:
+            return parts[0].take_with_pairs(_argsort(parts[0].ids))
         columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS}
         for name in ("ids", "agents", "drives"):
             columns[name] = tuple(text for part in parts for text in getattr(part, name))
         joined = cls(**columns)
-        order = np.array(sorted(range(len(joined.ids)), key=lambda k: joined.ids[k]), np.int64)
+        order = _argsort(joined.ids)
         sums = [part.pairs for part in parts if part.pairs is not None]
-        pairs = _concatenate_pairs(sums) if len(sums) == len(parts) else None
-        return replace(joined, pairs=pairs).take_with_pairs(order)
+        return replace(joined.take(order), pairs=_merge_pairs(sums, order) if len(sums) == len(parts) else None)
 
 
 _COLUMNS = (
@@ -125,17 +128,28 @@ _COLUMNS = (
 )
 
 
-def _concatenate_pairs(parts: Sequence[PairSums]) -> PairSums:
-    sizes = np.concatenate([np.diff(part.offsets) for part in parts])
-    return PairSums(
-        np.concatenate([part.own for part in parts]),
-        np.concatenate(([0], np.cumsum(sizes))).astype(np.int64),
-        np.concatenate([part.other_ids for part in parts]),
-        np.concatenate([part.shared for part in parts]),
-    )
+def _argsort(ids: Sequence[str]) -> Ints:
+    return np.array(sorted(range(len(ids)), key=ids.__getitem__), np.int64)
 
 
-def _take_pairs(pairs: PairSums, order: Ints) -> PairSums:
+def _merge_pairs(parts: Sequence[PairSums], order: Ints) -> PairSums:
+    """Return the pairs of all parts, in the order given of the rows of one after the other; each is copied once."""
+    counts = np.concatenate([np.diff(part.offsets) for part in parts])
+    offsets = np.concatenate(([0], np.cumsum(counts[order])))
+    begins = np.empty(len(order), np.int64)
+    begins[order] = offsets[:-1]
+    other_ids = np.empty((offsets[-1], *parts[0].other_ids.shape[1:]), np.uint8)
+    shared = np.empty((offsets[-1], *parts[0].shared.shape[1:]))
+    first = 0
+    for part in parts:
+        begin = begins[first : first + len(part.own)]
+        first += len(part.own)
+        places = np.arange(len(part.shared)) + np.repeat(begin - part.offsets[:-1], np.diff(part.offsets))
+        other_ids[places], shared[places] = part.other_ids, part.shared
+    return PairSums(np.concatenate([part.own for part in parts])[order], offsets, other_ids, shared)
+
+
+def take_pairs(pairs: PairSums, order: Ints) -> PairSums:
     """Return the pairs of the chosen observations, in the order given."""
     offsets, places = take_rows(pairs.offsets, order)
     return PairSums(pairs.own[order], offsets, pairs.other_ids[places], pairs.shared[places])
@@ -162,4 +176,4 @@ def make_initial_solution(arrays: ObservationArrays) -> PoseSolution:
         agent_weight=np.ones(count),
         is_surveyed=np.asarray(arrays.trusted).astype(np.float64),
     )
-    return start.take(np.array(sorted(range(count), key=lambda k: arrays.ids[k]), np.int64))
+    return start.take(_argsort(arrays.ids))

@@ -40,6 +40,7 @@ from manyeyes.maps.fusion.pose_optimization import (
     search_coarse_poses,
     settle_domain,
     solve_domain,
+    take_near_domain,
     weigh_agents,
 )
 from manyeyes.maps.fusion.pose_solution import PoseSolution, make_initial_solution
@@ -402,7 +403,8 @@ def _compute(task: StepTask) -> tuple[dict[str, object], tuple[FailedObservation
 def _compute_solve(task: StepTask) -> tuple[dict[str, object], tuple[FailedObservation, ...]]:
     """Solve a domain, without the observations with which that fails."""
     solver = task.job.config.pose_solver
-    whole = PoseSolution.cat([load_result(task.job, key, PoseSolution) for key in task.inputs])
+    parts = (load_result(task.job, key, PoseSolution) for key in task.inputs)
+    whole = PoseSolution.cat([take_near_domain(part, task.place, solver) for part in parts])
 
     def solve(rows: Sequence[int]) -> tuple[PoseSolution, AgentSums]:
         part = whole.take_with_pairs(np.array(rows, np.int64))
