@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array
-from scipy.sparse.linalg import LinearOperator, SuperLU, cg, splu
+from scipy.sparse.linalg import LinearOperator, cg
 
-from manyeyes._jit import F64x1, F64x3, I64x1, njit
 from manyeyes.maps.fusion.pair_blocks import PairBlocks
+from manyeyes.maps.fusion.sparse_inverse import SymmetricFactor, solve_by_factors
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -81,13 +81,13 @@ class JointPriors:
 @dataclass(frozen=True, eq=False)
 class JointStep:
     """Result of one step: increments of the poses (O, 3), biases (S, 3), weights (O,) of the priors of the observations' own
-    errors, and the factorized system, None where it was solved iteratively.
+    errors, and the factors of the system, None where it was solved iteratively.
     """
 
     increment: Floats
     bias: Floats
     own_weight: Floats
-    factor: SuperLU | None
+    factor: SymmetricFactor | None
 
 
 def compute_prior_weights(priors: JointPriors, scale: float) -> tuple[Floats, Floats]:
@@ -124,13 +124,7 @@ def solve_joint_step(pairs: PairBlocks, priors: JointPriors, scale: float, toler
     system = assemble_joint_system(pairs, priors, own_weight, drive_weight)
     factor = None
     if tolerance is None:
-        factor = splu(
-            system.to_matrix().tocsc(),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
-        found = factor.solve(system.right_side)
+        found, factor = solve_by_factors(system.to_matrix().tocsc(), system.right_side)
     else:
         found = _solve_iteratively(system, tolerance)
     count = 3 * len(priors.correction)
@@ -171,8 +165,12 @@ class JointSystem:
         """Return the whole matrix."""
         row, other, coupling = self.pairs.row, self.pairs.other, self.pairs.coupling
         size = len(self.right_side) // 3
-        both = [(row, other, coupling), (other, row, coupling.transpose(0, 2, 1))]
-        return self.apart + bsr_from_blocks(both, size)
+        own_row = np.repeat(np.arange(size), np.diff(self.apart.indptr))
+        families = [
+            (own_row, self.apart.indices, self.apart.data), (row, other, coupling),
+            (other, row, coupling.transpose(0, 2, 1)),
+        ]  # fmt: skip
+        return bsr_from_blocks(families, size)
 
 
 def assemble_joint_system(
@@ -213,68 +211,3 @@ def bsr_from_blocks(families: list[tuple[Ints, Ints, Floats]], size: int) -> bsr
     row, column = np.divmod(place[begins], size)
     offsets = np.concatenate(([0], np.cumsum(np.bincount(row, minlength=size))))
     return bsr_array((np.add.reduceat(block[order], begins), column, offsets), shape=(3 * size, 3 * size))
-
-
-def compute_marginal_covariance(factor: SuperLU, count: int) -> Floats:
-    """Compute the diagonal blocks (count, 3, 3) of the inverse of a symmetric system from its factors, of the first unknowns.
-
-    The inverse is computed on the pattern of the factor alone (Takahashi, Fagan and Chin, 1973; Erisman and Tinney, 1975).
-    """
-    lower = factor.L.tocsc()
-    lower.sort_indices()
-    values = _invert_on_pattern(
-        lower.indptr.astype(np.int64), lower.indices.astype(np.int64), lower.data, factor.U.diagonal()
-    )
-    # Row perm_r[i] of the factor is row i of the system; columns go alike in symmetric mode.
-    place = np.asarray(factor.perm_r, np.int64)
-    out = np.empty((count, 3, 3))
-    _gather_blocks(place, lower.indptr.astype(np.int64), lower.indices.astype(np.int64), values, out)
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _invert_on_pattern(
-    offsets: I64x1, rows: I64x1, lower: F64x1, diagonal: F64x1
-) -> F64x1:  # pragma: no cover - compiled
-    """Compute the inverse of L D L' at the entries of L (unit lower, sorted columns with the diagonal first)."""
-    out, size = np.zeros(len(lower)), len(diagonal)
-    place, total = np.full(size, -1), np.zeros(size)
-    for j in range(size - 1, -1, -1):
-        a, b = offsets[j] + 1, offsets[j + 1]
-        for k in range(a, b):
-            place[rows[k]] = k
-            total[rows[k]] = 0.0
-        for k in range(a, b):
-            r, f = rows[k], lower[k]
-            # Column r of the inverse holds the entries (i, r) with i >= r; each serves (i, r) and (r, i).
-            total[r] += out[offsets[r]] * f
-            for m in range(offsets[r] + 1, offsets[r + 1]):
-                i = rows[m]
-                if place[i] >= 0:
-                    total[i] += out[m] * f
-                    total[r] += out[m] * lower[place[i]]
-        own = 1.0 / diagonal[j]
-        for k in range(a, b):
-            out[k] = -total[rows[k]]
-            own -= lower[k] * out[k]
-        out[offsets[j]] = own
-        for k in range(a, b):
-            place[rows[k]] = -1
-    return out
-
-
-@njit(cache=True, nogil=True)
-def _gather_blocks(
-    place: I64x1, offsets: I64x1, rows: I64x1, values: F64x1, out: F64x3
-) -> None:  # pragma: no cover - compiled
-    """Gather the blocks (N, 3, 3) on the diagonal; place: row of the factor of each unknown."""
-    for o in range(len(out)):
-        for i in range(3):
-            for j in range(3):
-                one, two = place[3 * o + i], place[3 * o + j]
-                low, high = min(one, two), max(one, two)
-                out[o, i, j] = 0.0
-                for k in range(offsets[low], offsets[low + 1]):
-                    if rows[k] == high:
-                        out[o, i, j] = values[k]
-                        break

@@ -58,6 +58,9 @@ class PoseSolverConfig:
         domain_halo_m, since a domain sees no farther.
     domain_m, domain_halo_m: the ground is divided into squares of this side, the origin in the middle of one; the poses in one are
         solved with all that lie within the halo around it, and what lies farther away stays where it is during a step.
+    max_factorized, covariance_squares, covariance_halo_m: the marginal covariance is that of the factorized system of a domain
+        with at most so many observations; of more, that of so many squares along each side (an odd number), with a halo of at most
+        this width.
     agent_tolerance, agent_scale, max_agent_error: of an agent's mean correction, in standard deviations: up to the first its weight
         is 1, then it falls with this Geman-McClure scale, and beyond the last the agent is rejected.
     observation_error_m: standard deviation of corrections beside that of the prior pose, from errors that all lines of an
@@ -92,6 +95,9 @@ class PoseSolverConfig:
     drive_support_m: float = 300.0
     domain_m: float = 1536.0
     domain_halo_m: float = 384.0
+    max_factorized: int = 12_000
+    covariance_squares: int = 3
+    covariance_halo_m: float = 256.0
     agent_tolerance: float = 1.6
     agent_scale: float = 0.8
     max_agent_error: float = 2.5
@@ -107,6 +113,10 @@ class PoseSolverConfig:
                 f"PoseSolverConfig: drive_support_m ({self.drive_support_m:g} m) is larger than domain_halo_m "
                 f"({self.domain_halo_m:g} m), beyond which a domain sees no observations of a drive; lower drive_support_m or "
                 "raise domain_halo_m."
+            )
+        if self.covariance_squares % 2 != 1:
+            raise ConfigError(
+                f"PoseSolverConfig.covariance_squares: expected an odd number; got {self.covariance_squares}. Set it to 1 or 3."
             )
 
     @property

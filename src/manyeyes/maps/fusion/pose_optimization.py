@@ -42,7 +42,6 @@ from manyeyes.maps.fusion.coarse_search import find_isolated_shifts, search_coar
 from manyeyes.maps.fusion.joint_solver import (
     JointPriors,
     JointStep,
-    compute_marginal_covariance,
     make_drive_chain,
     solve_joint_step,
 )
@@ -63,7 +62,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 STEP_TOLERANCE = 1e-5
-"""Relative residual of the joint steps but the last; what is left of a step is in the next one."""
+"""Relative residual of the joint steps; what is left of a step is in the next one."""
 _BOUND_CELL_M = 8.0
 _PAIR_CELL_M = 1.0
 _STRIP_M = 64.0
@@ -227,6 +226,7 @@ def merge_solutions(
         if solved is None or not np.array_equal(near, rows):
             rows, solved = near, _solve_near(whole.take_with_pairs(near), step, config)
         state, found = _select_domain(*solved, domain, config)
+        state = _add_common_covariance(state, whole.take_with_pairs(near), step, config) if step.is_last else state
         states.append(state)
         sums.append(found)
     table = weigh_agents(AgentSums.merge(sums), AgentWeights.of_state(whole), step, config)
@@ -259,7 +259,12 @@ def list_domains(prior_pose: Floats, config: PoseSolverConfig = DEFAULT_ALIGN) -
 
 
 def _domain_indices(prior_pose: Floats, config: PoseSolverConfig) -> Ints:
-    return np.floor(prior_pose[:, :2] / config.domain_m + 0.5).astype(np.int64)
+    return _square_indices(prior_pose, config.domain_m)
+
+
+def _square_indices(prior_pose: Floats, side_m: float) -> Ints:
+    """Return column and row (O, 2) of the square that each prior pose lies in; the origin is the middle of one."""
+    return np.floor(prior_pose[:, :2] / side_m + 0.5).astype(np.int64)
 
 
 def find_domain_area(domain: tuple[int, int], config: PoseSolverConfig) -> tuple[float, float, float, float]:
@@ -287,7 +292,8 @@ def solve_domain(
     near = PoseSolution.cat([take_near_domain(part, domain, config) for part in parts])
     if not len(near.ids):
         return near, AgentSums.of((), np.zeros((0, NUM_COLUMNS)))
-    return _select_domain(*_solve_near(near, step, config), domain, config)
+    state, sums = _select_domain(*_solve_near(near, step, config), domain, config)
+    return _add_common_covariance(state, near, step, config) if step.is_last else state, sums
 
 
 def take_near_domain(
@@ -317,15 +323,41 @@ def _solve_near(near: PoseSolution, step: SolverStep, config: PoseSolverConfig) 
     assert step.joint is not None and near.pairs is not None
     blocks = PairBlocks.of_sums(near.pairs, near.ids)
     priors = _make_priors(near, config)
-    # The last step is solved by factors, which give the covariance, too.
-    solved = solve_joint_step(blocks, priors, step.joint.prior_scale, None if step.is_last else STEP_TOLERANCE)
+    solved = solve_joint_step(blocks, priors, step.joint.prior_scale, STEP_TOLERANCE)
     state = _apply_step(near, blocks, priors, solved, config)
-    if solved.factor is not None:
-        marginal = compute_marginal_covariance(solved.factor, len(near.ids))
-        marginal[priors.fixed] = near.prior_covariance[priors.fixed]
-        marginal = bound_covariance(marginal, near.prior_covariance, state.correction, step.joint.prior_scale)
-        state = replace(state, common_covariance=marginal - state.covariance)
     return state, _make_columns(state, blocks.own, near.pairs, config)
+
+
+def _add_common_covariance(
+    at_home: PoseSolution, near: PoseSolution, step: SolverStep, config: PoseSolverConfig
+) -> PoseSolution:
+    """Add the common covariance to the observations of a domain after a step; near: all within its halo before the step.
+
+    The marginal covariance is that of the system of the domain or, where that is too large to be factorized, of the system around
+    each of smaller squares, beyond whose halo poses are fixed. Too large means densely seen, where that lowers standard deviations
+    by less than 1 %; on a street that seven drives saw it would lower them by a tenth.
+    """
+    assert step.joint is not None
+    side, halo = config.domain_m, config.domain_halo_m
+    if len(near.ids) > config.max_factorized:
+        side, halo = side / config.covariance_squares, min(halo, config.covariance_halo_m)
+    reach = side / 2 + halo
+    common, square_of = np.empty_like(at_home.covariance), _square_indices(at_home.prior_pose, side)
+    for square in np.unique(square_of, axis=0):
+        offset = near.prior_pose[:, :2] - square * side
+        part = near.take_with_pairs(np.flatnonzero(((offset >= -reach) & (offset < reach)).all(1)))
+        assert part.pairs is not None
+        priors = _make_priors(part, config)
+        factor = solve_joint_step(PairBlocks.of_sums(part.pairs, part.ids), priors, step.joint.prior_scale).factor
+        assert factor is not None
+        marginal = factor.compute_diagonal_blocks(len(part.ids))
+        marginal[priors.fixed] = part.prior_covariance[priors.fixed]
+        home = np.flatnonzero((square_of == square).all(1))
+        state = at_home.take(home)
+        marginal = marginal[part.row_indices(state.ids)]
+        bounded = bound_covariance(marginal, state.prior_covariance, state.correction, step.joint.prior_scale)
+        common[home] = bounded - state.covariance
+    return replace(at_home, common_covariance=common)
 
 
 def bound_covariance(

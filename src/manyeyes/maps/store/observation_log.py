@@ -12,7 +12,7 @@ import difflib
 import hashlib
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -225,8 +225,12 @@ class ObservationLog:
         self.rejected += tuple(RejectedRows(f"{self.place}/{name}", r.row, 1, r.reason) for r in invalid)
 
 
-def _read_rows(objects: ObjectStore, segment: str, groups: Sequence[int]) -> list[Observation | InvalidRow]:
-    """Read the rows of some row groups; one that is no observation has an id that agrees with its content.
+def _read_rows(
+    objects: ObjectStore, segment: str, groups: Sequence[int], ids: Set[str] | None = None
+) -> list[Observation | InvalidRow]:
+    """Read the rows of some row groups, those of the ids alone if they are given.
+
+    One that is no observation has an id that agrees with its content.
 
     Such a row is what an older version, with wider limits, wrote. Any other wrong row is damage, hence a StoreError.
     """
@@ -236,6 +240,8 @@ def _read_rows(objects: ObjectStore, segment: str, groups: Sequence[int]) -> lis
     try:
         with objects.open(f"{LOG}/{segment}") as file:
             table = parquet.ParquetFile(file, page_checksum_verification=True).read_row_groups(list(groups))
+        if ids is not None:
+            table = table.filter(np.array([name in ids for name in table["id"].to_pylist()], bool))
     except (ArrowException, OSError) as error:
         reason = " ".join(str(error).split())
         raise StoreError(f"{place}: expected a whole segment of the log; {reason}. Restore it from a copy.") from None
@@ -254,9 +260,9 @@ def read_active(objects: ObjectStore, active: ActiveObservations, row_indices: N
     out: dict[str, Observation] = {}
     for number in np.unique(active.segment[row_indices]).tolist():
         groups = np.unique(active.row_group[row_indices[active.segment[row_indices] == number]]).tolist()
-        for o in _read_rows(objects, active.segments[number], groups):
+        for o in _read_rows(objects, active.segments[number], groups, wanted_ids):
             # Rows outside the limits are left out.
-            if isinstance(o, Observation) and o.id in wanted_ids:
+            if isinstance(o, Observation):
                 out[o.id] = o
     missing = wanted_ids - set(out)
     if missing:
