@@ -26,7 +26,7 @@ Ints = NDArray[np.int64]
 
 _MAX_COLUMNS = 256
 """That are done together."""
-_invert_triangle = get_lapack_funcs("trtri", dtype=np.float64)
+(_invert_triangle,) = get_lapack_funcs(("trtri",), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
