@@ -226,6 +226,27 @@ def test_an_element_is_stored_in_the_tile_of_its_lesser_end(two_lanes):
     assert compute_home_tiles(two_lanes(250.0, 0.0)).tolist()[3] == [1, -1]
 
 
+def test_damage_of_the_log_is_named_and_rows_that_are_not_asked_for_are_no_matter(tmp_path):
+    import pyarrow as pa
+    import pyarrow.parquet as parquet
+
+    store, seen = MapStore.create(tmp_path / "s", FRAME), [_observation(k) for k in range(4)]
+    with store.open_for_writing() as log:
+        log.append(seen)
+        active = log.active_observations()
+    (path,) = (tmp_path / "s/log").glob("*.parquet")
+    whole = parquet.read_table(path)
+    ids = whole["id"].to_pylist()
+    poses = [x + 1.0 if name == active.ids[0] else x for name, x in zip(ids, whole["x"].to_pylist())]
+    parquet.write_table(whole.set_column(whole.column_names.index("x"), "x", pa.array(poses)), path)
+    assert [o.id for o in read_active(store.objects, active, np.arange(1, 4))] == list(active.ids[1:])
+    with pytest.raises(StoreError, match=rf"observation with id {active.ids[0]}.*Restore the file"):
+        read_active(store.objects, active, np.arange(4))
+    parquet.write_table(whole.drop_columns(["id"]), path)
+    with pytest.raises(StoreError, match=r"whole segment of the log; .*id.*Restore it"):
+        read_active(store.objects, active, np.arange(4))
+
+
 def test_damage_is_named(two_lanes, tmp_path):
     store = MapStore.create(tmp_path, FRAME)
     with pytest.raises(StoreError, match="no release yet"):

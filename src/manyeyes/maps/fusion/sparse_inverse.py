@@ -6,7 +6,8 @@ Columns J one after the other that have the same rows R below them are done toge
 
     Z_RJ = -Z_RR Y,    Z_JJ = L_JJ^-T D_J^-1 L_JJ^-1 - Z_RJ' Y,    Y = L_RJ L_JJ^-1
 
-All entries of Z_RR are on the pattern of the columns R.
+All entries of Z_RR are on the pattern of the columns R: what a column holds below its first row under the diagonal, the column of
+that row holds, too. An entry of L that cancels to an exact zero is not stored by the solver, and is put back.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _MAX_COLUMNS = 256
-"""That are done together."""
+"""How many columns are done together."""
 (_invert_triangle,) = get_lapack_funcs(("trtri",), dtype=np.float64)
 
 
@@ -54,14 +55,48 @@ def solve_by_factors(matrix: csc_array, right_side: Floats) -> tuple[Floats, Sym
     """Solve a symmetric positive definite system, and return its factors, too."""
     solver = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     found, lower, place = solver.solve(right_side), solver.L, np.asarray(solver.perm_r, np.int64)
-    # Its upper factor is not read, since it takes as much memory again.
+    # It holds both factors twice, once in a form of its own.
     del solver
     lower.sort_indices()
-    offsets, diagonal = lower.indptr.astype(np.int64), np.empty(len(place))
+    offsets, rows, values = _close_pattern(lower.indptr.astype(np.int64), lower.indices, lower.data)
+    diagonal = np.empty(len(place))
     # Row place[i] of the factor is row i of the system; columns go alike in symmetric mode.
     diagonal[place] = matrix.diagonal()
-    _divide_out(offsets, lower.indices, lower.data, diagonal)
-    return found, SymmetricFactor(offsets, lower.indices, lower.data, diagonal, place)
+    _divide_out(offsets, rows, values, diagonal)
+    return found, SymmetricFactor(offsets, rows, values, diagonal, place)
+
+
+def _close_pattern(offsets: Ints, rows: NDArray[np.int32], lower: Floats) -> tuple[Ints, NDArray[np.int32], Floats]:
+    """Return the columns of L with the entries that cancelled, as zeros; see :class:`SymmetricFactor`."""
+    if _is_closed(offsets, rows):
+        return offsets, rows, lower
+    columns = np.split(rows, offsets[1:-1])
+    for j in range(len(columns)):
+        if len(columns[j]) > 1:
+            first = int(columns[j][1])
+            columns[first] = np.union1d(columns[first], columns[j][1:])
+    closed = np.concatenate(([0], np.cumsum([len(column) for column in columns])))
+    values = np.zeros(closed[-1])
+    for j, column in enumerate(columns):
+        a, b = offsets[j], offsets[j + 1]
+        values[closed[j] + np.searchsorted(column, rows[a:b])] = lower[a:b]
+    return closed, np.concatenate(columns), values
+
+
+@njit(cache=True, nogil=True)
+def _is_closed(offsets: I64x1, rows: I32x1) -> bool:  # pragma: no cover - compiled
+    """Return whether every column's rows below its first one under the diagonal are rows of the column of that one."""
+    for j in range(len(offsets) - 1):
+        a, b = offsets[j] + 1, offsets[j + 1]
+        if a == b:
+            continue
+        k, end = offsets[rows[a]], offsets[rows[a] + 1]
+        for m in range(a, b):
+            while k < end and rows[k] < rows[m]:
+                k += 1
+            if k == end or rows[k] != rows[m]:
+                return False
+    return True
 
 
 def _invert_on_pattern(factor: SymmetricFactor) -> Floats:

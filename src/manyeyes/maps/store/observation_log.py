@@ -228,9 +228,7 @@ class ObservationLog:
 def _read_rows(
     objects: ObjectStore, segment: str, groups: Sequence[int], ids: Set[str] | None = None
 ) -> list[Observation | InvalidRow]:
-    """Read the rows of some row groups, those of the ids alone if they are given.
-
-    One that is no observation has an id that agrees with its content.
+    """Read the rows of some row groups, or those of some ids alone; a row that is no observation has the id of its content.
 
     Such a row is what an older version, with wider limits, wrote. Any other wrong row is damage, hence a StoreError.
     """
@@ -242,14 +240,15 @@ def _read_rows(
             table = parquet.ParquetFile(file, page_checksum_verification=True).read_row_groups(list(groups))
         if ids is not None:
             table = table.filter(np.array([name in ids for name in table["id"].to_pylist()], bool))
-    except (ArrowException, OSError) as error:
+    except (ArrowException, OSError, KeyError) as error:
         reason = " ".join(str(error).split())
         raise StoreError(f"{place}: expected a whole segment of the log; {reason}. Restore it from a copy.") from None
     out = list(iterate_rows(table))
     for row, item in enumerate(out):
         if isinstance(item, InvalidRow) and not item.id:
+            stated = shorten(table["id"][row].as_py()) if "id" in table.column_names else "none"
             raise StoreError(
-                f"{place}: row {row} of groups {list(groups)[:3]}: {item.reason} Restore the file from a copy."
+                f"{place}: groups {list(groups)[:3]}, observation with id {stated}: {item.reason} Restore the file from a copy."
             )
     return out
 
