@@ -10,7 +10,6 @@ y
 """
 
 from dataclasses import replace
-from itertools import product
 
 import numpy as np
 import pytest
@@ -21,8 +20,16 @@ from manyeyes.datatypes import Transform
 from manyeyes.models.detector.box_head import BOX_LAYOUT
 from manyeyes.models.detector.proposal import PROPOSAL_DIM
 from manyeyes.models.fusion.registry import get_fusion
-from manyeyes.models.fusion.sender_shift import DEFAULT_SHIFT, Peaks, align_senders, estimate_shift, find_peaks
-from manyeyes.models.fusion.transform_tokens import AgentTokens
+from manyeyes.models.fusion.sender_shift import (
+    DEFAULT_SHIFT,
+    Peaks,
+    SenderShift,
+    align_senders,
+    estimate_shift,
+    find_peaks,
+    find_probabilities_off,
+)
+from manyeyes.models.fusion.transform_tokens import AgentTokens, split_last
 
 OBJECTS = torch.tensor([[4.0, 3.0], [-9.0, 7.0], [12.0, -6.0], [-3.0, -12.0], [15.0, 11.0], [-16.0, -2.0], [0.5, 16.0]])
 
@@ -71,17 +78,44 @@ def test_a_displaced_sender_is_brought_back(dx: float, dy: float, yaw: float) ->
     assert float(after.sigma_m.max()) < 0.5
 
 
+def test_evidence_of_others_decides_what_weak_evidence_means() -> None:
+    """Two common objects 0.9 m off: nothing moves where three others are exact, the sender comes back where they are off, too."""
+    true, stated = pose(5.0, 5.0, 0.3), pose(5.6, 5.0, 0.3)
+    part = sender(true, stated, OBJECTS[:1])
+    part.tokens[:, CHANNELS:][:, BOX_LAYOUT.log_sigma_xy] = -1.2
+    exact = [sender(pose(x, 1.0), pose(x, 1.0)) for x in (-6.0, 2.0, 7.0)]
+    off = [sender(pose(x, 1.0), pose(x + 0.9, 1.0)) for x in (-6.0, 2.0, 7.0)]
+    before, among_exact, among_off = (tokens_of(agent(OBJECTS), part, *others) for others in ([], exact, off))
+    mine = [t.sender == 1 for t in (before, among_exact, among_off)]
+    assert torch.equal(align_senders(among_exact).xy[mine[1]], before.xy[mine[0]])
+    moved = align_senders(among_off).xy[mine[2]] - before.xy[mine[0]]
+    assert float(moved[0, 0]) < -0.3
+
+
+def test_the_egos_own_earlier_tokens_are_no_evidence_and_stay() -> None:
+    """They are exact but for odometry; counted as senders they would show that poses are reliable."""
+    true, stated = pose(5.0, 5.0, 0.3), pose(5.6, 5.0, 0.3)
+    part = sender(true, stated, OBJECTS[:1])
+    part.tokens[:, CHANNELS:][:, BOX_LAYOUT.log_sigma_xy] = -1.2
+    earlier = [sender(pose(-x, 0.0), pose(-x, 0.0)) for x in (1.0, 2.0, 3.0)]
+    tokens, alone = tokens_of(agent(OBJECTS), part, *earlier), tokens_of(agent(OBJECTS), part)
+    past = split_last(tokens, 2)
+    found, want = align_senders(tokens, past), align_senders(alone)
+    assert torch.equal(found.xy[found.sender <= 1], want.xy) and torch.equal(found.xy[found.sender > 1], past.xy)
+    assert not torch.equal(align_senders(tokens).xy[tokens.sender == 1], want.xy[alone.sender == 1])
+
+
 def test_each_sender_has_its_own_shift_and_the_batch_its_own_egos() -> None:
     a, b = pose(5.0, 5.0, 0.3), pose(-6.0, 1.0, -2.0)
     parts = [agent(OBJECTS), sender(a, pose(5.9, 5.0, 0.3)), sender(b, pose(-6.0, 0.1, -2.0))]
-    other = [replace(agent(OBJECTS[:2]), ego=1), replace(sender(a, pose(5.9, 5.0, 0.3)), ego=1)]
+    other = [replace(agent(OBJECTS[:0]), ego=1), replace(sender(a, pose(5.9, 5.0, 0.3)), ego=1)]
     both = align_senders(tokens_of(*parts, *other, batch_size=2))
     first = both.ego == 0
     for number in (1, 2):
         mine = first & (both.sender == number)
         place = both.xy[mine] + both.proposal[mine][:, BOX_LAYOUT.offset] * GRID.cell_size_m
         assert float((place - OBJECTS).norm(dim=1).max()) < 0.25
-    # Two common objects are too few: nothing moves.
+    # The other ego detects nothing: its senders stay.
     before = tokens_of(*other, batch_size=2)
     assert torch.equal(both.xy[~first], before.xy)
 
@@ -106,7 +140,7 @@ def test_a_sender_without_evidence_is_left_alone(others: torch.Tensor) -> None:
 
 def test_a_row_of_equal_distances_is_ambiguous() -> None:
     """Parked vehicles 4 m apart, and a sender that is half a distance off: either neighbour would do."""
-    row = torch.stack((torch.arange(6) * 4.0 - 10, torch.full((6,), 5.0)), 1)
+    row = torch.stack((torch.arange(12) * 4.0 - 23, torch.full((12,), 5.0)), 1)
     true = pose(0.0, 0.0)
     before = tokens_of(agent(row), sender(true, pose(2.0, 0.0), row))
     assert torch.equal(align_senders(before).xy, before.xy)
@@ -148,63 +182,63 @@ def test_features_keep_their_gradient_when_a_moved_token_leaves_the_grid() -> No
     assert part.tokens.grad[: len(OBJECTS), :CHANNELS].eq(1).all() and not part.tokens.grad[-1].any()
 
 
-def slow_shift(ego: Peaks, other: Peaks, origin: np.ndarray) -> tuple[np.ndarray, int] | None:
-    """The estimate (3,) and its pairs, in loops."""
-    c, near = DEFAULT_SHIFT, lambda d: d @ d <= DEFAULT_SHIFT.max_shift_m**2
-    pairs = [
-        (i, j)
-        for i, j in product(range(len(other.center)), range(len(ego.center)))
-        if near(ego.center[j] - other.center[i])
-    ]
-    if len({i for i, _ in pairs}) < c.min_pairs:
-        return None
-    away = {p: ego.center[p[1]] - other.center[p[0]] for p in pairs}
-    strength = {(i, j): (other.weight[i] * ego.weight[j]) ** 0.5 for i, j in pairs}
+def slow_log_likelihood(ego: Peaks, other: Peaks, origin: np.ndarray, error: np.ndarray, sigma_yaw: float) -> float:
+    """The logarithm of the ratio of probabilities, in loops over all pairs of peaks."""
+    c, total = DEFAULT_SHIFT, 0.0
+    for i in range(len(other.center)):
+        x, y = other.center[i] - origin
+        expected = np.array([[1, 0, -y], [0, 1, x]]) @ error
+        density = 0.0
+        for j in range(len(ego.center)):
+            away = ego.center[j] - other.center[i]
+            variance = other.sigma[i] ** 2 + ego.sigma[j] ** 2 + c.min_sigma_m**2 + sigma_yaw**2 * (x * x + y * y) / 2
+            square = (away - expected) @ (away - expected) / variance
+            if away @ away <= (2 * c.max_shift_m) ** 2 and square <= c.max_deviation**2:
+                normal = np.exp(-square / 2) / (2 * np.pi * variance)
+                density += (other.weight[i] * ego.weight[j]) ** 0.5 * normal
+        total += np.log(1 + density / c.clutter_per_m2)
+    return total
 
-    def vote(d: np.ndarray) -> float:
-        total = 0.0
-        for i in {i for i, _ in pairs}:
-            total += max(
-                strength[p] * np.exp(-((away[p] - d) @ (away[p] - d)) / (2 * c.vote_m**2)) for p in pairs if p[0] == i
-            )
-        return total * np.exp(-(d @ d) / (8 * c.prior_sigma_m**2))
 
-    candidates = [np.zeros(2), *(away[p] for p in pairs)]
-    votes = [vote(d) for d in candidates]
-    mode = candidates[int(np.argmax(votes))]
-    apart = [v for v, d in zip(votes, candidates) if (d - mode) @ (d - mode) > (2 * c.match_m) ** 2]
-    if apart and max(apart) > c.max_second * max(votes):
+def slow_shift(ego: Peaks, other: Peaks, origin: np.ndarray) -> tuple[np.ndarray, float, float] | None:
+    """The estimate (3,), the number of pairs and the evidence, by general linear algebra."""
+    c = DEFAULT_SHIFT
+    away = (ego.center[None] - other.center[:, None]).reshape(-1, 2)
+    if not (np.linalg.norm(away, axis=1) <= 2 * c.max_shift_m).any():
         return None
-    for _ in range(3):
-        share = {p: strength[p] * np.exp(-((away[p] - mode) @ (away[p] - mode)) / (2 * c.vote_m**2)) for p in pairs}
-        mode = sum(share[p] * away[p] for p in pairs) / sum(share.values())
-    far = {p: (away[p] - mode) @ (away[p] - mode) for p in pairs}
-    chosen = [
-        p
-        for p in pairs
-        if far[p] == min(far[q] for q in pairs if q[0] == p[0]) == min(far[q] for q in pairs if q[1] == p[1])
-        if far[p] <= c.match_m**2
-    ]
-    if len(chosen) < c.min_pairs:
+    candidates = [np.zeros(2), *away[np.linalg.norm(away, axis=1) <= c.max_shift_m]]
+    found = np.array(
+        [
+            slow_log_likelihood(ego, other, origin, np.array([*d, 0]), c.prior_sigma_yaw_rad)
+            - d @ d / (2 * c.prior_sigma_m**2)
+            for d in candidates
+        ]
+    )
+    best = candidates[int(found.argmax())]
+    is_apart = np.array([np.linalg.norm(d - best) > c.apart_m for d in candidates])
+    if (found[is_apart] > found.max() * c.max_second).any():
         return None
     prior = np.diag([c.prior_sigma_m**-2, c.prior_sigma_m**-2, c.prior_sigma_yaw_rad**-2])
-    robust, estimate = dict.fromkeys(chosen, 1.0), np.zeros(3)
-    for _ in range(4):
-        normal, right = prior.copy(), np.zeros(3)
-        for i, j in chosen:
+    estimate, normal, number = np.array([*best, 0.0]), prior, 0.0
+    for _ in range(c.iterations):
+        normal, right, number = prior.copy(), np.zeros(3), 0.0
+        for i in range(len(other.center)):
             x, y = other.center[i] - origin
             h = np.array([[1, 0, -y], [0, 1, x]])
-            scale = strength[i, j] / (c.object_sigma_m**2 + other.sigma[i] ** 2 + ego.sigma[j] ** 2)
-            normal += robust[i, j] * scale * h.T @ h
-            right += robust[i, j] * scale * h.T @ away[i, j]
+            variance = other.sigma[i] ** 2 + ego.sigma**2 + c.min_sigma_m**2
+            displacement = ego.center - other.center[i]
+            square = ((displacement - h @ estimate) ** 2).sum(1) / variance
+            is_pair = (square <= c.max_deviation**2) & (np.linalg.norm(displacement, axis=1) <= 2 * c.max_shift_m)
+            density = is_pair * np.sqrt(other.weight[i] * ego.weight) * np.exp(-square / 2) / (2 * np.pi * variance)
+            share = density / (density.sum() + c.clutter_per_m2)
+            number += share.sum()
+            normal += (share / variance).sum() * h.T @ h
+            right += h.T @ ((share / variance) @ displacement)
         estimate = np.linalg.solve(normal, right)
-        for i, j in chosen:
-            x, y = other.center[i] - origin
-            rest = away[i, j] - np.array([[1, 0, -y], [0, 1, x]]) @ estimate
-            scale = strength[i, j] / (c.object_sigma_m**2 + other.sigma[i] ** 2 + ego.sigma[j] ** 2)
-            robust[i, j] = 1 / (1 + scale * rest @ rest / 4)
-    chi2 = estimate @ (normal - prior) @ estimate
-    return (estimate, len(chosen)) if chi2 >= c.min_chi2 else None
+    of_pairs = slow_log_likelihood(ego, other, origin, estimate, 0.0)
+    of_pairs -= slow_log_likelihood(ego, other, origin, np.zeros(3), 0.0)
+    evidence = c.evidence_scale * of_pairs + (np.log(np.linalg.det(prior) / np.linalg.det(normal))) / 2
+    return estimate, number, evidence - estimate @ prior @ estimate / 2
 
 
 def test_the_estimate_is_that_of_loops() -> None:
@@ -220,8 +254,54 @@ def test_the_estimate_is_that_of_loops() -> None:
         assert (fast is None) == (slow is None)
         if fast is not None and slow is not None:
             found_any += 1
-            assert np.allclose([*fast.shift, fast.yaw], slow[0], atol=1e-9) and fast.num_pairs == slow[1]
+            assert np.allclose([*fast.shift, fast.yaw], slow[0], atol=1e-9)
+            assert (fast.num_pairs, fast.evidence) == pytest.approx(slow[1:], abs=1e-8)
     assert found_any > 15
+
+
+def test_one_pair_by_hand() -> None:
+    """A peak 0.5 m beside the ego's one, at the sender's own place: it has no lever, so the heading is that of the prior.
+
+    variance .3^2 + .3^2 + .1^2 = .19; the share of the pair at the end and the estimate hold each other: shift = .5 a / (a + 1), a
+    the precision of the pair.
+    """
+    peaks = [Peaks(np.array([[x, 0.0]]), np.array([1.0]), np.array([0.3])) for x in (0.5, 0.0)]
+    found = estimate_shift(peaks[0], peaks[1], np.zeros(2))
+    assert found is not None
+
+    def density(error: float) -> float:
+        return float(np.exp(-(error**2) / (2 * 0.19)) / (2 * np.pi * 0.19)) / 0.02
+
+    rest = 0.5 - found.shift[0]
+    share = density(rest) / (1 + density(rest))
+    assert found.shift == pytest.approx([0.5 * share / (share + 0.19), 0.0], abs=1e-6) and found.yaw == 0.0
+    assert found.num_pairs == pytest.approx(share, abs=1e-4)
+    want = 1.25 * np.log((1 + density(rest)) / (1 + density(0.5))) - found.shift[0] ** 2 / 2 - np.log(share / 0.19 + 1)
+    assert found.evidence == pytest.approx(want, abs=1e-4)
+    # No yaw is measured: its variance is that of the prior.
+    assert found.covariance[2, 2] == pytest.approx(0.014**2)
+
+
+def test_probabilities_by_hand() -> None:
+    """Even evidence leaves the prior, 1/2 of .9 and of .05; one sender's evidence changes what that of another means."""
+    assert find_probabilities_off([]) == []
+    assert find_probabilities_off([0.0]) == pytest.approx([0.475])
+    # Ratio 9: pairs are .1 + 8.1 = 8.2 times as probable if unreliable, .95 + .45 = 1.4 if reliable.
+    unreliable = 8.2 / (8.2 + 1.4)
+    want = unreliable * 8.1 / 8.2 + (1 - unreliable) * 0.45 / 1.4
+    assert find_probabilities_off([np.log(9)]) == pytest.approx([want])
+    alone, among_exact, among_off = (find_probabilities_off([1.0, *[e] * 4])[0] for e in (0.0, -8.0, 20.0))
+    assert among_exact < 0.2 < alone < among_off < 1
+    assert find_probabilities_off([1e9, -1e9]) == pytest.approx([1, 0], abs=1e-9)
+
+
+def test_an_expected_correction_is_a_mixture() -> None:
+    whole = SenderShift(np.array([1.0, 0.0]), 0.02, np.zeros(2), np.diag([0.04, 0.04, 1e-4]), 5.0, 0.0)
+    half = whole.if_off_with(0.5)
+    assert half.shift.tolist() == [0.5, 0.0] and half.yaw == 0.01
+    # Half of the variance, and a quarter of the square of the distance of the two.
+    assert half.covariance[0, 0] == pytest.approx(0.02 + 0.25) and half.covariance[1, 1] == pytest.approx(0.02)
+    assert half.covariance[0, 2] == pytest.approx(0.25 * 0.02)
 
 
 def test_a_peak_is_the_most_confident_token_of_its_surroundings() -> None:

@@ -5,6 +5,7 @@ import json
 import math
 import shutil
 import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -88,6 +89,25 @@ def test_the_commit_is_that_of_the_package_and_marks_changed_files(tmp_path, mon
     assert git_commit() == commit
     (package / "__init__.py").write_text("changed = True")
     assert git_commit() == commit + "+changes"
+
+
+def test_an_installed_package_has_the_commit_that_pip_recorded(tmp_path, monkeypatch) -> None:
+    package, about = tmp_path / "manyeyes", tmp_path / "manyeyes-0.1.0.dist-info"
+    (package / "studies").mkdir(parents=True)
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: manyeyes\nVersion: 0.1.0\n")
+    monkeypatch.setattr(provenance, "__file__", str(package / "studies" / "provenance.py"))
+    monkeypatch.setattr("sys.path", [str(tmp_path), *sys.path])
+    origin = about / "direct_url.json"
+    for text in (None, "{", "[]", '{"archive_info": {}}', '{"vcs_info": {"vcs": "git"}}'):
+        if text is not None:
+            origin.write_text(text)
+        assert git_commit() is None, text
+    origin.write_text('{"url": "file:///x", "vcs_info": {"vcs": "git", "commit_id": "0123abcd"}}')
+    assert git_commit() == "0123abcd"
+    # A package that runs from elsewhere is not the installed one.
+    monkeypatch.setattr(provenance, "__file__", str(tmp_path / "other" / "manyeyes" / "studies" / "provenance.py"))
+    assert git_commit() is None
 
 
 def test_plain_keeps_what_json_has_and_names_the_rest() -> None:

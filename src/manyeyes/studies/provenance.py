@@ -38,7 +38,10 @@ def installed_versions() -> dict[str, str | None]:
 
 
 def git_commit() -> str | None:
-    """Return the commit of the sources that run, with ``+changes`` if tracked files differ; None outside a checkout."""
+    """Return the commit of the sources that run, with ``+changes`` if tracked files differ.
+
+    An installed package has one if pip installed it from a repository (``pip install "manyeyes @ git+..."``); else None.
+    """
     package = Path(__file__).resolve().parents[1]
 
     def git(*words: str) -> str | None:
@@ -51,9 +54,22 @@ def git_commit() -> str | None:
 
     # A package installed inside another project's repository must not report that repository's commit.
     if git("ls-files", "--error-unmatch", "__init__.py") is None:
-        return None
+        return _find_installed_commit(package)
     commit = git("rev-parse", "HEAD")
     return commit and commit + ("+changes" if git("status", "--porcelain", "--untracked-files=no") else "")
+
+
+def _find_installed_commit(package: Path) -> str | None:
+    """Return the commit that pip recorded beside an installed package (PEP 610), if it is this one."""
+    try:
+        installed = importlib.metadata.distribution("manyeyes")
+        origin = json.loads(installed.read_text("direct_url.json") or "{}")
+    except (importlib.metadata.PackageNotFoundError, OSError, ValueError):
+        return None
+    if Path(str(installed.locate_file("manyeyes"))).resolve() != package.resolve():
+        return None
+    source = origin.get("vcs_info") if isinstance(origin, dict) else None
+    return source.get("commit_id") if isinstance(source, dict) else None
 
 
 def cpu_name() -> str:

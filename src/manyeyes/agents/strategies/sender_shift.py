@@ -27,7 +27,7 @@ class ShiftedFusion(IntermediateFusion):
     ) -> tuple[Tokens, Tokens | None]:
         """Return the tokens that are fused, those of senders moved, and the ego's own past ones among them, if any."""
         tokens, past = super().gather(cache, frame, messages)
-        return align_senders(tokens), past
+        return align_senders(tokens, past), past
 
 
 @register_strategy("intermediate-shift-temporal")

@@ -1,14 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Estimate the pose error of each sender from its tokens, and move the tokens back before they are fused; ours.
 
-Peaks of the ego's and of a sender's tokens are proposed centres of objects. Pairs of them vote for a displacement; the pairs of its
-mode give position and yaw in closed form: least squares with a Gaussian prior, so that few pairs move little. Nothing is moved
-without enough pairs, with a second mode of almost as many votes, or where chi2 is below a low limit, so that estimates near their
-own error do move tokens. Headings of proposals and vector channels are not turned; errors of yaw are a degree or so.
+Peaks of the ego's and of a sender's tokens are proposed centres of objects with a stated error. A sender's peak is an object of the
+ego's, moved by the pose error, or clutter. The most probable error is found from the displacements of pairs, and refined by
+expectation maximization with a Gaussian prior: few or uncertain pairs move little.
+
+Whether a sender is off at all is decided for all senders of an ego together, by the evidence of each. Either poses are reliable,
+and few senders are off, or they are not, as between high buildings or where the ego's own pose is wrong, and most are. A sender's
+tokens move by the estimate times the probability that it is off. Headings of proposals and vector channels are not turned; errors
+of yaw are a degree or so.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +32,9 @@ from manyeyes.models.fusion.token_merge import DRIFT_MPS, MAX_OFFSET_CELLS
 from manyeyes.models.fusion.transform_tokens import Tokens
 
 F64 = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+_MAX_EVIDENCE = 50.0
+"""Evidence beyond it, e^50 to one, decides alone."""
 
 
 @dataclass(frozen=True)
@@ -36,29 +45,37 @@ class ShiftConfig:
         min_score: peaks of lower confidence take no part.
         peak_radius_m: a peak is the most confident token within this distance.
         max_peaks: the most confident peaks of an agent that take part.
-        max_shift_m: largest displacement of a pair.
-        min_pairs: fewer pairs move nothing.
-        vote_m: width of the votes, for the error of centres and the turn by an error of yaw.
-        match_m: largest distance of a pair after the shift of the mode.
-        max_second: share of the best vote that a displacement apart from it may have.
-        object_sigma_m: error of the distance of two centres of one object, beside what proposals state.
-        prior_sigma_m: prior of the position error, each axis.
-        prior_sigma_yaw_rad: prior of the yaw error.
-        min_chi2: least squared length of the estimate in units of its own covariance.
+        max_shift_m: largest displacement at which an estimate begins.
+        max_deviation: largest deviation of a pair, in its standard deviations.
+        min_sigma_m: error of the distance of two centres of one object, beside what proposals state.
+        clutter_per_m2: density of peaks that no object of the ego explains.
+        prior_sigma_m: of the position error of a sender that is off, each axis.
+        prior_sigma_yaw_rad: of its yaw error.
+        apart_m: displacements farther from each other than this are different ones.
+        max_second: share of the log-likelihood of the best displacement that a different one may have.
+        iterations: of expectation maximization.
+        evidence_scale: factor of the evidence of pairs; stated errors are a little too large.
+        off_if_unreliable: share of senders that are off where poses are unreliable, which is as probable as not.
+        off_if_reliable: the same where they are reliable.
+        min_probability: senders that are off with less probability stay.
     """
 
     min_score: float = 0.2
     peak_radius_m: float = 2.0
     max_peaks: int = 48
     max_shift_m: float = 2.5
-    min_pairs: int = 3
-    vote_m: float = 0.5
-    match_m: float = 1.25
-    max_second: float = 0.8
-    object_sigma_m: float = 0.3
+    max_deviation: float = 4.0
+    min_sigma_m: float = 0.1
+    clutter_per_m2: float = 0.02
     prior_sigma_m: float = 1.0
     prior_sigma_yaw_rad: float = 0.014
-    min_chi2: float = 2.0
+    apart_m: float = 1.0
+    max_second: float = 0.9
+    iterations: int = 8
+    evidence_scale: float = 1.25
+    off_if_unreliable: float = 0.9
+    off_if_reliable: float = 0.05
+    min_probability: float = 0.2
 
 
 DEFAULT_SHIFT = ShiftConfig()
@@ -77,14 +94,16 @@ class Peaks:
 class SenderShift:
     """Estimated correction of a sender: p becomes p + shift + yaw J (p - origin), J a quarter turn to the left.
 
-    covariance: (3, 3) of x, y, yaw after the correction. num_pairs: that it rests on.
+    covariance: (3, 3) of x, y, yaw after the correction. num_pairs: sum of the probabilities of the pairs that it rests on.
+    evidence: logarithm of how much more probable the pairs are if the sender is off.
     """
 
     shift: F64
     yaw: float
     origin: F64
     covariance: F64
-    num_pairs: int
+    num_pairs: float
+    evidence: float
 
     def move(self, xy: F64) -> F64:
         """Return corrected positions (n, 2)."""
@@ -97,26 +116,45 @@ class SenderShift:
         of_xy = (self.covariance[0, 0] + self.covariance[1, 1]) / 2
         return np.sqrt(of_xy + self.covariance[2, 2] * (arm**2).sum(1) / 2)
 
+    def if_off_with(self, probability: float) -> SenderShift:
+        """Return the expected correction of a sender that is off with this probability, and exact else."""
+        whole = np.array([*self.shift, self.yaw])
+        spread = probability * (1 - probability) * np.outer(whole, whole)
+        expected, covariance = probability * whole, probability * self.covariance + spread
+        return replace(self, shift=expected[:2], yaw=float(expected[2]), covariance=covariance)
+
 
 def estimate_shift(ego: Peaks, sender: Peaks, origin: F64, config: ShiftConfig = DEFAULT_SHIFT) -> SenderShift | None:
-    """Return the correction of a sender at origin (2,) in the ego's frame; None where the peaks do not give one."""
+    """Return the correction of a sender at origin (2,) in the ego's frame, if it is off; None where the peaks do not give one."""
     settings = ShiftSettings(**{name: getattr(config, name) for name in ShiftSettings._fields})
-    partner, mode = np.empty(len(sender.center), np.int64), np.empty(2)
-    if not _shift_kernels.find_mode(ego.center, ego.weight, sender.center, sender.weight, settings, mode):
+    pairs = _shift_kernels.list_pairs(
+        ego.center, ego.sigma, ego.weight, sender.center, sender.sigma, sender.weight, origin, settings
+    )
+    estimate, covariance = np.zeros(3), np.empty((3, 3))
+    if not (len(pairs.away) and _shift_kernels.find_start(pairs, settings, estimate)):
         return None
-    num_pairs = _shift_kernels.match_peaks(ego.center, sender.center, mode, settings, partner)
-    if num_pairs < config.min_pairs:
+    num_pairs = _shift_kernels.solve_pairs(pairs, settings, estimate, covariance)
+    if not np.isfinite(estimate).all():
         return None
-    rows = (partner >= 0).nonzero()[0]
-    columns = partner[rows]
-    variance = config.object_sigma_m**2 + sender.sigma[rows] ** 2 + ego.sigma[columns] ** 2
-    precision = np.sqrt(ego.weight[columns] * sender.weight[rows]) / variance
-    measured, arm = ego.center[columns] - sender.center[rows], sender.center[rows] - origin
-    estimate, covariance = np.empty(3), np.empty((3, 3))
-    chi2 = _shift_kernels.solve_pairs(arm, measured, precision, settings, estimate, covariance)
-    if not (chi2 >= config.min_chi2 and np.isfinite(estimate).all()):
-        return None
-    return SenderShift(estimate[:2], float(estimate[2]), origin, covariance, num_pairs)
+    evidence = config.evidence_scale * (
+        _shift_kernels.find_log_likelihood(pairs, *estimate, 0.0, settings)
+        - _shift_kernels.find_log_likelihood(pairs, 0.0, 0.0, 0.0, 0.0, settings)
+    )
+    # Laplace's approximation of the integral over all errors of the prior.
+    prior = np.array([config.prior_sigma_m, config.prior_sigma_m, config.prior_sigma_yaw_rad])
+    evidence += (math.log(np.linalg.det(covariance)) - ((estimate / prior) ** 2).sum()) / 2 - np.log(prior).sum()
+    return SenderShift(estimate[:2], float(estimate[2]), origin, covariance, num_pairs, float(evidence))
+
+
+def find_probabilities_off(evidence: Sequence[float], config: ShiftConfig = DEFAULT_SHIFT) -> list[float]:
+    """Return the probability that each sender of one ego is off, from the evidence of all that have an estimate."""
+    shares = np.array([[config.off_if_unreliable], [config.off_if_reliable]])
+    ratio = np.exp(np.clip(np.array(evidence, np.float64), -_MAX_EVIDENCE, _MAX_EVIDENCE))
+    # (2, n) probability of the pairs where poses are unreliable and where they are reliable, over that of exact poses.
+    pairs = 1 - shares + shares * ratio
+    log_odds = np.log(pairs[0] / pairs[1]).sum()
+    unreliable = 1 / (1 + math.exp(-np.clip(log_odds, -_MAX_EVIDENCE, _MAX_EVIDENCE)))
+    return (np.array([unreliable, 1 - unreliable]) @ (shares * ratio / pairs)).tolist()
 
 
 def find_peaks(xy: F64, heat: F64, sigma: F64, config: ShiftConfig = DEFAULT_SHIFT) -> Peaks:
@@ -129,22 +167,30 @@ def find_peaks(xy: F64, heat: F64, sigma: F64, config: ShiftConfig = DEFAULT_SHI
     return Peaks(xy[kept], score[kept], np.clip(sigma[kept], 0.0, 2.0))
 
 
-def align_senders(tokens: Tokens, config: ShiftConfig = DEFAULT_SHIFT) -> Tokens:
+def align_senders(tokens: Tokens, past: Tokens | None = None, config: ShiftConfig = DEFAULT_SHIFT) -> Tokens:
     """Return the tokens with those of each sender moved by its estimated correction, and the position sigma that is left.
 
-    Tokens of senders without an estimate, and the ego's own current ones, stay as they are. There is no gradient to positions;
-    that of features stays.
+    Tokens of senders without an estimate, and the ego's own ones, stay as they are. There is no gradient to positions; that of
+    features stays. past: the ego's own earlier tokens, where they are the last rows of tokens.
     """
     with torch.no_grad():
-        places, pose_context = _find_places(tokens, config)
+        places, pose_context = _find_places(tokens, _count_own(tokens, past), config)
         inside = (tokens.sender == 0) | tokens.grid.contains(places)
         rows = None if bool(inside.all()) else inside.nonzero()[:, 0]
     aligned = replace(tokens, xy=places, pose_context=pose_context)
     return aligned if rows is None else aligned.select(rows)
 
 
-def _find_places(tokens: Tokens, config: ShiftConfig) -> tuple[Tensor, Tensor]:
-    """Return the corrected positions and pose contexts."""
+def _count_own(tokens: Tokens, past: Tokens | None) -> int:
+    """Return how many of the last senders are the ego itself at earlier instants; one ego."""
+    if past is None or not len(past.sender) or tokens.batch_size > 1:
+        return 0
+    first = len(tokens.sender) - len(past.sender)
+    return int(past.sender.max()) if first >= 0 and torch.equal(past.xy, tokens.xy[first:]) else 0
+
+
+def _find_places(tokens: Tokens, num_own: int, config: ShiftConfig) -> tuple[Tensor, Tensor]:
+    """Return the corrected positions and pose contexts. num_own: of the last senders, which are the ego itself."""
     cell_m = tokens.grid.cell_size_m
     offset = proposed_offset(tokens.proposal)
     follows = (offset.abs().amax(1) <= MAX_OFFSET_CELLS)[:, None]
@@ -160,15 +206,21 @@ def _find_places(tokens: Tokens, config: ShiftConfig) -> tuple[Tensor, Tensor]:
     own = {ego: (egos == ego) & (senders == 0) for ego in range(tokens.batch_size)}
     own_peaks = {ego: find_peaks(center[m], heat[m], sigma[m], config) for ego, m in own.items()}
     moved, left = xy.copy(), context[:, 3].copy()
-    for number in np.unique(group[senders > 0]):
+    estimates: dict[int, list[tuple[Flags, SenderShift]]] = {ego: [] for ego in own}
+    is_other = (senders > 0) & (senders <= senders.max(initial=0) - num_own)
+    for number in np.unique(group[is_other]):
         mine = group == number
-        peaks = find_peaks(center[mine], heat[mine], sigma[mine], config)
-        found = estimate_shift(
-            own_peaks[int(egos[mine][0])], peaks, _origin(xy[mine], sender_xy[mine], context[mine]), config
-        )
+        peaks, ego = find_peaks(center[mine], heat[mine], sigma[mine], config), int(egos[mine][0])
+        origin = _origin(xy[mine], sender_xy[mine], context[mine])
+        found = estimate_shift(own_peaks[ego], peaks, origin, config)
         if found is not None:
-            moved[mine] = found.move(xy[mine])
-            left[mine] = found.sigma_m(xy[mine])
+            estimates[ego].append((mine, found))
+    for of_ego in estimates.values():
+        chances = find_probabilities_off([found.evidence for _, found in of_ego], config)
+        for (mine, found), chance in zip(of_ego, chances, strict=True):
+            if chance >= config.min_probability:
+                expected = found.if_off_with(chance)
+                moved[mine], left[mine] = expected.move(xy[mine]), expected.sigma_m(xy[mine])
     pose_context = tokens.pose_context.clone()
     pose_context[:, 3] = torch.from_numpy(left).to(pose_context)
     changed = torch.from_numpy((moved != xy).any(1)).to(tokens.xy.device)
@@ -186,7 +238,7 @@ def _origin(xy: F64, sender_xy: F64, context: F64) -> F64:
 
 def _build_aligned_fast(channels: int, attention: AttentionConfig) -> nn.Module:
     module = get_fusion("fast")(channels, attention)
-    module.register_forward_pre_hook(lambda _, given: (align_senders(given[0]), *given[1:]))
+    module.register_forward_pre_hook(lambda _, given: (align_senders(*given[:2]), *given[1:]))
     return module
 
 
