@@ -170,6 +170,7 @@ def test_what_is_no_result_is_refused(tmp_path: Path) -> None:
         (f"<!-- report: picture p.png -->\n{END}\n", "page: a marker of a picture is"),
         (f"<!-- report: all/a-evaluate.json other -->\n{END}\n", "has no table other; it has methods"),
         (f"<!-- report: seeds late -->\n{END}\n", "page: a marker of seeds is"),
+        (f"<!-- report: training-seeds 5=a.json -->\n{END}\n", "page: a marker of seeds of main tables is"),
     ],
 )
 def test_bad_markers_are_refused(root: Path, text: str, match: str) -> None:
@@ -178,7 +179,15 @@ def test_bad_markers_are_refused(root: Path, text: str, match: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "marker", ["none.json", "none.json methods", "folder", "picture none.png A plot", "seeds late ours=none.json"]
+    "marker",
+    [
+        "none.json",
+        "none.json methods",
+        "folder",
+        "picture none.png A plot",
+        "seeds late ours=none.json",
+        "training-seeds 5=none.json 6=other.json",
+    ],
 )
 def test_what_is_not_stored_reads_not_run(root: Path, marker: str) -> None:
     path = "folder" if marker == "folder" else "none.png" if "picture" in marker else "none.json"

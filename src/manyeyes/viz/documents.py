@@ -8,6 +8,7 @@ A marker is a comment on a line of its own, the table stands below it, and ``<!-
 - ``<!-- report: FILE.json TABLE ... -->``: some of its tables, by name (``methods``, ``operating-point``, ``differences``, ...);
 - ``<!-- report: seeds STRATEGY NAME=FILE.json,FILE.json NAME=... -->``: methods that were trained from several seeds;
   differences are those of the first to the others;
+- ``<!-- report: training-seeds SEED=FILE.json SEED=FILE.json ... -->``: main tables of several training seeds, side by side;
 - ``<!-- report: picture FILE.png TEXT -->``: a picture that a study drew, with its text;
 - ``<!-- report: figure NAME FILE.json ... -->``: a figure drawn from files of results, light and dark, in docs/images/plots.
 
@@ -24,6 +25,7 @@ from pathlib import Path
 
 from manyeyes.datatypes import ConfigError
 from manyeyes.viz.figure_svg import THEMES
+from manyeyes.viz.seed_comparison import make_seed_comparison
 from manyeyes.viz.stored_figures import FIGURES, draw_figure
 from manyeyes.viz.stored_tables import StoredTable, load_result, make_seed_tables, make_tables
 from manyeyes.viz.table import NOT_RUN, format_markdown_lines
@@ -98,6 +100,9 @@ def _make_parts(words: Sequence[str], results: Path, name: str) -> Iterator[str]
     """Yield the Markdown of one marker, by its words."""
     if words[0] == "seeds":
         yield from _make_seed_parts(words[1:], results, name)
+        return
+    if words[0] == "training-seeds":
+        yield from _make_seed_comparison(words[1:], results, name)
         return
     if words[0] == "picture":
         yield _make_picture(words[1:], results, name)
@@ -175,6 +180,23 @@ def _make_seed_parts(words: Sequence[str], results: Path, name: str) -> Iterator
     runs = [(method, load_result(results / file)) for method, file in named]
     yield from _format_tables(make_seed_tables(runs, words[0]), has_titles=True)
     yield from (f"- {method}: {stored.origin}" for method, stored in runs)
+    yield ""
+
+
+def _make_seed_comparison(words: Sequence[str], results: Path, name: str) -> Iterator[str]:
+    files = {seed: file for seed, _, file in (word.partition("=") for word in words)}
+    if len(files) < 2 or not all(files.values()):
+        raise ConfigError(
+            f"{name}: a marker of seeds of main tables is 'training-seeds SEED=FILE.json SEED=FILE.json ...'; "
+            f"got {' '.join(words) or 'nothing'}."
+        )
+    missing = [file for file in files.values() if not (results / file).is_file()]
+    if missing:
+        yield _name_missing(missing[0])
+        return
+    stored = {seed: load_result(results / file) for seed, file in files.items()}
+    yield from _format_tables(make_seed_comparison({s: one.result for s, one in stored.items()}), has_titles=True)
+    yield from (f"- seed {seed}: {one.origin}" for seed, one in stored.items())
     yield ""
 
 

@@ -136,14 +136,15 @@ def estimate_shift(ego: Peaks, sender: Peaks, origin: F64, config: ShiftConfig =
     num_pairs = _shift_kernels.solve_pairs(pairs, settings, estimate, covariance)
     if not np.isfinite(estimate).all():
         return None
+    x, y, yaw = estimate.tolist()
     evidence = config.evidence_scale * (
-        _shift_kernels.find_log_likelihood(pairs, *estimate, 0.0, settings)
+        _shift_kernels.find_log_likelihood(pairs, x, y, yaw, 0.0, settings)
         - _shift_kernels.find_log_likelihood(pairs, 0.0, 0.0, 0.0, 0.0, settings)
     )
     # Laplace's approximation of the integral over all errors of the prior.
     prior = np.array([config.prior_sigma_m, config.prior_sigma_m, config.prior_sigma_yaw_rad])
     evidence += (math.log(np.linalg.det(covariance)) - ((estimate / prior) ** 2).sum()) / 2 - np.log(prior).sum()
-    return SenderShift(estimate[:2], float(estimate[2]), origin, covariance, num_pairs, float(evidence))
+    return SenderShift(estimate[:2], yaw, origin, covariance, num_pairs, float(evidence))
 
 
 def find_probabilities_off(evidence: Sequence[float], config: ShiftConfig = DEFAULT_SHIFT) -> list[float]:
