@@ -18,7 +18,9 @@ from manyeyes.datatypes.map_element import MapElements, Polygons
 from manyeyes.maps.elements.observation import MapFrame, Observation, ObservationError
 from manyeyes.maps.elements.observation_file import (
     METADATA_KEY,
+    InvalidRow,
     iterate_observations,
+    iterate_rows,
     make_file_metadata,
     observation_table,
     read_observations,
@@ -309,3 +311,25 @@ def test_a_group_of_rows_that_expands_without_bound_is_put_aside(
     reading = read_observations(tmp_path)
     (aside,) = reading.rejected
     assert reading.observations == () and aside.count == 4 and "expected at most 10 values a column" in aside.reason
+
+
+def test_a_row_with_the_id_of_a_checked_observation_is_not_checked_again(monkeypatch) -> None:
+    many = crowd(3)
+    table = observation_table(many, FRAME)
+    checked = {o.id for o in many[:2]}
+    seen = []
+    monkeypatch.setattr("manyeyes.maps.elements.observation._check", lambda o: seen.append(o.id))
+    made = list(iterate_rows(table, checked))
+    assert seen == [many[2].id] and all(isinstance(o, Observation) for o in made)
+    for got, want in zip(made, many, strict=True):
+        assert got.id == want.id and got.canonical_bytes() == want.canonical_bytes()
+        assert not got.pose.flags.writeable
+
+
+def test_a_changed_row_is_no_checked_observation() -> None:
+    """Its content has another id than the one that it states."""
+    many = crowd(3)
+    table = observation_table(many, FRAME)
+    moved = table.set_column(table.column_names.index("x"), "x", pa.array([o.pose[0] + 1.0 for o in many]))
+    made = list(iterate_rows(moved, {o.id for o in many}))
+    assert all(isinstance(item, InvalidRow) and "the hash of its content" in item.reason for item in made)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
@@ -189,12 +189,15 @@ def iterate_observations(table: pa.Table) -> Iterator[tuple[int, Observation | s
         yield row, item.reason if isinstance(item, InvalidRow) else item
 
 
-def iterate_rows(table: pa.Table) -> Iterator[Observation | InvalidRow]:
-    """Yield each row of a table as an observation, or as one that is refused."""
+def iterate_rows(table: pa.Table, checked_ids: Set[str] = frozenset()) -> Iterator[Observation | InvalidRow]:
+    """Yield each row of a table as an observation, or as one that is refused.
+
+    checked_ids: of observations that were checked before. A row whose content has such an id is not checked again.
+    """
     columns = _ObservationColumns(table)
     for row in range(table.num_rows):
         try:
-            yield columns.make_observation(row)
+            yield columns.make_observation(row, checked_ids)
         except (ObservationError, ShapeError) as error:
             yield columns.make_invalid_row(row, str(error))
 
@@ -353,11 +356,12 @@ class _ObservationColumns:
         self.points = np.stack((_to_floats(x), _to_floats(y)), 1)
         self.sigma = _to_floats(sigma.fill_null(DEFAULT_SIGMA_M))
 
-    def make_observation(self, row: int) -> Observation:
+    def make_observation(self, row: int, checked_ids: Set[str]) -> Observation:
         """Return the observation of one row; raises ObservationError or ShapeError where it is none."""
-        content = self.make_content(row)
+        content, stated = self.make_content(row), self.text["id"][row]
+        if stated in checked_ids and stated == content.id:
+            return Observation.of_checked(content)
         made = Observation(**{f.name: getattr(content, f.name) for f in fields(ObservationContent)})
-        stated = self.text["id"][row]
         if stated and stated != made.id:
             raise ObservationError(
                 f"Observation.id: expected {made.id}, the hash of its content; got {shorten(stated)}. Fetch it again."

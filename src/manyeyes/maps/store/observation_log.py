@@ -228,7 +228,7 @@ class ObservationLog:
 def _read_rows(
     objects: ObjectStore, segment: str, groups: Sequence[int], ids: Set[str] | None = None
 ) -> list[Observation | InvalidRow]:
-    """Read the rows of some row groups, or those of some ids alone; a row that is no observation has the id of its content.
+    """Read the rows of some row groups, or those of some indexed ids alone; a row that is no observation has the id of its content.
 
     Such a row is what an older version, with wider limits, wrote. Any other wrong row is damage, hence a StoreError.
     """
@@ -243,7 +243,7 @@ def _read_rows(
     except (ArrowException, OSError, KeyError) as error:
         reason = " ".join(str(error).split())
         raise StoreError(f"{place}: expected a whole segment of the log; {reason}. Restore it from a copy.") from None
-    out = list(iterate_rows(table))
+    out = list(iterate_rows(table, ids or frozenset()))
     for row, item in enumerate(out):
         if isinstance(item, InvalidRow) and not item.id:
             stated = shorten(table["id"][row].as_py()) if "id" in table.column_names else "none"
