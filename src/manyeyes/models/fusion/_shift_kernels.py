@@ -145,11 +145,11 @@ def find_start(pairs: Pairs, settings: ShiftSettings, start: F64x1) -> bool:  # 
         if found[c] > found[best]:
             best = c
     start[0], start[1] = (pairs.away[best - 1, 0], pairs.away[best - 1, 1]) if best > 0 else (0.0, 0.0)
-    least = found[best] * settings.max_second
+    threshold = found[best] * settings.max_second
     for c in range(count + 1):
         x, y = (pairs.away[c - 1, 0], pairs.away[c - 1, 1]) if c > 0 else (0.0, 0.0)
         square = (x - start[0]) * (x - start[0]) + (y - start[1]) * (y - start[1])
-        if found[c] > least and square > settings.apart_m * settings.apart_m:
+        if found[c] > threshold and square > settings.apart_m * settings.apart_m:
             return False
     return True
 
