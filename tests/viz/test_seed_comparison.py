@@ -42,29 +42,30 @@ def test_spread_and_claims_by_hand() -> None:
     """Variances 2e-4, 0, 2e-4, 0: pooled .01. Near is 0.02 off, twice that; uncertain has no resolved second seed."""
     results = {"5": table(FIRST, SIDES), "6": table(SECOND, SIDES | {"uncertain": (-0.1, 0.3)})}
     found = make_seed_comparison(results)
-    assert [one.name for one in found] == ["ap50-clean", "ap70-clean"]
-    assert found[0].title == "AP@0.5 at the answer, clean; standard deviation over seeds, pooled: 0.010"
-    assert found[0].lines == [
-        ("method", "seed 5", "seed 6", "mean", "sd over seeds", "ours - method", "claimed"),
-        ("intermediate", "0.800", "0.820", "0.810", "0.014", "-", "-"),
-        ("near", "0.790", "0.790", "0.790", "0.000", "+0.020", "yes"),
-        ("far", "0.600", "0.620", "0.610", "0.014", "+0.200", "yes"),
-        ("uncertain", "0.600", "0.600", "0.600", "0.000", "+0.210", "no"),
+    assert found.title == "AP at the answer of trainings from 2 seeds"
+    assert found.lines[:6] == [
+        ("disturbance", "metric", "method", "seed 5", "seed 6", "mean", "sd", "ours - method", "claimed"),
+        ("clean", "AP@0.5", "intermediate", "0.800", "0.820", "0.810", "0.014", "-", "-"),
+        ("clean", "AP@0.5", "near", "0.790", "0.790", "0.790", "0.000", "+0.020", "yes"),
+        ("clean", "AP@0.5", "far", "0.600", "0.620", "0.610", "0.014", "+0.200", "yes"),
+        ("clean", "AP@0.5", "uncertain", "0.600", "0.600", "0.600", "0.000", "+0.210", "no"),
+        ("clean", "AP@0.5", "pooled", "-", "-", "-", "0.010", "-", "-"),
     ]
+    assert [line[1] for line in found.lines[6:]] == ["AP@0.7"] * 5
 
 
 def test_a_small_or_changing_difference_is_not_claimed() -> None:
     near = [FIRST, SECOND | {"near": 0.80}]
     small = make_seed_comparison({str(k): table(values, SIDES) for k, values in enumerate(near)})
-    assert small[0].lines[2][-2:] == ("+0.015", "no")
+    assert small.lines[2][-2:] == ("+0.015", "no")
     turned = [table(FIRST, SIDES), table(SECOND, SIDES | {"far": (-0.3, -0.1)})]
-    assert make_seed_comparison({"5": turned[0], "6": turned[1]})[0].lines[3][-1] == "no"
+    assert make_seed_comparison({"5": turned[0], "6": turned[1]}).lines[3][-1] == "no"
 
 
 def test_what_is_not_common_is_left_out_and_what_is_no_main_table_is_refused() -> None:
     without = {name: value for name, value in SECOND.items() if name != "far"}
     found = make_seed_comparison({"5": table(FIRST, SIDES), "6": table(without, SIDES)})
-    assert [line[0] for line in found[0].lines[1:]] == ["intermediate", "near", "uncertain"]
+    assert [line[2] for line in found.lines[1:]] == ["intermediate", "near", "uncertain", "pooled"] * 2
     with pytest.raises(ConfigError, match="two seeds or more; got 1"):
         make_seed_comparison({"5": table(FIRST, SIDES)})
     with pytest.raises(ConfigError, match="seed 6: expected a result of 'manyeyes study main-table'"):

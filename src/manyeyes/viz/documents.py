@@ -195,7 +195,7 @@ def _make_seed_comparison(words: Sequence[str], results: Path, name: str) -> Ite
         yield _name_missing(missing[0])
         return
     stored = {seed: load_result(results / file) for seed, file in files.items()}
-    yield from _format_tables(make_seed_comparison({s: one.result for s, one in stored.items()}), has_titles=True)
+    yield from _format_tables([make_seed_comparison({s: one.result for s, one in stored.items()})], has_titles=False)
     yield from (f"- seed {seed}: {one.origin}" for seed, one in stored.items())
     yield ""
 

@@ -21,8 +21,8 @@ _OURS = "intermediate"
 _METRICS = ("AP@0.5", "AP@0.7")
 
 
-def make_seed_comparison(results: Mapping[str, Mapping[str, Any]]) -> tuple[StoredTable, ...]:
-    """Return a table for each disturbance and IoU that all main tables have, of the methods that all have, at the answer.
+def make_seed_comparison(results: Mapping[str, Mapping[str, Any]]) -> StoredTable:
+    """Return a table of the disturbances and methods that all main tables have, at the answer.
 
     results: of studies ``main-table`` by training seed, two at least, on one channel without pose corrector.
 
@@ -40,11 +40,22 @@ def make_seed_comparison(results: Mapping[str, Mapping[str, Any]]) -> tuple[Stor
     if not levels:
         raise ConfigError(f"The main tables of seeds {', '.join(results)} have no row {_OURS} in common.")
     differences = [_find_differences(result) for result in results.values()]
-    return tuple(
-        _make_table(list(results), [m for at, m in common if at == level], level, iou, cells, differences)
-        for level in levels
-        for iou in range(len(_METRICS))
+    heads = (
+        "disturbance",
+        "metric",
+        "method",
+        *(f"seed {seed}" for seed in results),
+        "mean",
+        "sd",
+        "ours - method",
+        "claimed",
     )
+    lines: Lines = [heads]
+    for level in levels:
+        methods = [method for at, method in common if at == level]
+        for iou in range(len(_METRICS)):
+            lines += _make_lines(methods, level, iou, cells, differences)
+    return StoredTable("training-seeds", f"AP at the answer of trainings from {len(results)} seeds", lines)
 
 
 def _find_cells(result: Mapping[str, Any]) -> dict[tuple[str, str], Sequence[Any]]:
@@ -58,21 +69,20 @@ def _find_differences(result: Mapping[str, Any]) -> dict[tuple[str, str], Mappin
     return {(one["description"], one["metric"]): one["interval"] for one in result["comparisons"]}
 
 
-def _make_table(
-    seeds: Sequence[str],
+def _make_lines(
     methods: Sequence[str],
     level: str,
     iou: int,
     cells: Sequence[Mapping[tuple[str, str], Sequence[Any]]],
     differences: Sequence[Mapping[tuple[str, str], Mapping[str, float]]],
-) -> StoredTable:
+) -> Lines:
+    """Make the lines of the methods under one disturbance, then one of the pooled standard deviation."""
     values = {method: [one[level, method][iou]["value"] for one in cells] for method in methods}
     pooled = math.sqrt(statistics.fmean(statistics.variance(column) for column in values.values()))
-    metric = _METRICS[iou]
-    lines: Lines = [("method", *(f"seed {s}" for s in seeds), "mean", "sd over seeds", "ours - method", "claimed")]
+    lines, metric = list[tuple[str, ...]](), _METRICS[iou]
     for method, column in values.items():
         mean = statistics.fmean(column)
-        line = (method, *(f"{value:.3f}" for value in column), f"{mean:.3f}", f"{statistics.stdev(column):.3f}")
+        line = (level, metric, method, *(f"{v:.3f}" for v in (*column, mean, statistics.stdev(column))))
         gain = statistics.fmean(values[_OURS]) - mean
         intervals = [_find_interval(one, method, level, metric) for one in differences]
         if method == _OURS or None in intervals:
@@ -81,10 +91,7 @@ def _make_table(
         sides = {(i["low"] > 0) - (i["high"] < 0) for i in intervals if i is not None}
         is_claimed = abs(gain) >= CLAIM_FACTOR * pooled and sides in ({1}, {-1})
         lines.append((*line, f"{gain:+.3f}", "yes" if is_claimed else "no"))
-    name = f"ap{'57'[iou]}0-{level.replace(' ', '-')}"
-    return StoredTable(
-        name, f"{metric} at the answer, {level}; standard deviation over seeds, pooled: {pooled:.3f}", lines
-    )
+    return [*lines, (level, metric, "pooled", *("-" for _ in cells), "-", f"{pooled:.3f}", "-", "-")]
 
 
 def _find_interval(
