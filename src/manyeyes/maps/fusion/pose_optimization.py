@@ -61,8 +61,8 @@ from manyeyes.maps.fusion.pose_solution import (
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-STEP_TOLERANCE, END_TOLERANCE = 1e-3, 1e-5
-"""Relative residual of a joint step, of which the next one solves what is left; and of the last step of a pass."""
+STEP_TOLERANCE = 1e-5
+"""Relative residual of the joint steps; what is left of a step is in the next one."""
 _BOUND_CELL_M = 8.0
 _PAIR_CELL_M = 1.0
 _STRIP_M = 64.0
@@ -323,8 +323,7 @@ def _solve_near(near: PoseSolution, step: SolverStep, config: PoseSolverConfig) 
     assert step.joint is not None and near.pairs is not None
     blocks = PairBlocks.of_sums(near.pairs, near.ids)
     priors = _make_priors(near, config)
-    tolerance = END_TOLERANCE if step.decides or step.is_last else STEP_TOLERANCE
-    solved = solve_joint_step(blocks, priors, step.joint.prior_scale, tolerance)
+    solved = solve_joint_step(blocks, priors, step.joint.prior_scale, STEP_TOLERANCE)
     state = _apply_step(near, blocks, priors, solved, config)
     return state, _make_columns(state, blocks.own, near.pairs, config)
 
