@@ -40,7 +40,7 @@ def installed_versions() -> dict[str, str | None]:
 def git_commit() -> str | None:
     """Return the commit of the sources that run, with ``+changes`` if tracked files differ.
 
-    An installed package has one if pip installed it from a repository (``pip install "manyeyes @ git+..."``); else None.
+    An installed package has one if pip installed it from a repository (``pip install git+URL``); else None.
     """
     package = Path(__file__).resolve().parents[1]
 
