@@ -367,7 +367,7 @@ def _peak() -> Iterator[list[float]]:
     max_gb, ended = [0.0, 0.0], threading.Event()
 
     def sample_memory() -> None:
-        while not ended.wait(0.25):
+        while not ended.wait(0.5):
             sizes = []
             for process in _family():
                 try:

@@ -194,6 +194,8 @@ def test_the_main_table_judges_both_forms_at_sweep_and_answer(main_table) -> Non
     assert "intermediate - F-Cooper, its-g5-6: 0.8 m, corrector voting" in descriptions
     assert "intermediate - no-fusion, its-g5-6: 0.8 m" in descriptions
     assert "intermediate, its-g5-6: 0.8 m, corrector voting - off" in descriptions
+    assert "intermediate, its-g5-6: 0.8 m, corrector voting - clean" in descriptions
+    assert "intermediate, its-g5-6: 0.8 m - clean" in descriptions
     assert not any("temporal" in d for d in descriptions), "ours has no form with memory here"
 
 

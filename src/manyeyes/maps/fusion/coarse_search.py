@@ -22,6 +22,9 @@ from manyeyes.maps.fusion.point_grid import build_grid, find_cell_range
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+NUM_LAYERS = 24
+"""Of a raster: six sectors of 30 degrees of each class."""
+
 
 class SearchParameters(NamedTuple):
     """The values of CoarseSearchConfig as compiled loops read them."""
@@ -50,14 +53,14 @@ class SearchedObservations(NamedTuple):
 
 
 class DrawnPoints(NamedTuple):
-    """Points in the order of their grid of 8 m: its keys and offsets, positions and unit tangents (P, 2) in the map's frame, and
-    agents (P,).
+    """Points in the order of their grid of 8 m: its keys and offsets, positions (P, 2) in the map's frame, headings (P,) of their
+    lines in half turns, and agents (P,).
     """
 
     keys: I64x1
     start: I64x1
     xy: F64x2
-    tangent: F64x2
+    heading: F64x1
     agent: I64x1
 
 
@@ -112,11 +115,15 @@ def search_coarse(arrays: ObservationArrays, keep: NDArray[np.bool_], home: Ints
     chosen = np.flatnonzero(keep)
     grid = build_grid(xy[chosen, 0], xy[chosen, 1], arrays.kind_of_point[chosen], 8.0)
     rows = chosen[grid.order]
-    drawn = DrawnPoints(
-        grid.keys, grid.offsets, xy[rows], tangent[rows], arrays.agent[arrays.observation_of_point[rows]]
-    )
+    agent = arrays.agent[arrays.observation_of_point[rows]]
+    drawn = DrawnPoints(grid.keys, grid.offsets, xy[rows], count_half_turns(tangent[rows]), agent)
     shifts = find_best_shifts(home, to_searched_observations(arrays), drawn, config.kernel_params)
     return apply_shifts(arrays, home, shifts)
+
+
+def count_half_turns(tangent: Floats) -> Floats:
+    """Compute the headings (P,), in half turns, of unit tangents (P, 2)."""
+    return np.arctan2(tangent[:, 1], tangent[:, 0]) / np.pi
 
 
 def to_searched_observations(arrays: ObservationArrays) -> SearchedObservations:
@@ -182,11 +189,13 @@ def find_best_shifts(
         nx = int((xy[a:b, 0].max() + max_shift + 2.0 - x0) / cell) + 1
         ny = int((xy[a:b, 1].max() + max_shift + 2.0 - y0) / cell) + 1
         frame = _RasterFrame(x0, y0, nx, ny, cell)
-        picture = _draw_layers(pose[o], int(agent[o]), others, frame)
+        picture, is_blurred = _count_points(pose[o], int(agent[o]), others, frame), np.zeros(NUM_LAYERS, np.bool_)
         best, bx, by, bt = 0.0, 0, 0, 0.0
         at_rest = 0.0
         for turn in yaw_steps:
-            score = _correlate(picture, frame, xy[a:b], tangent[a:b], kind[a:b], turn, radius, stride)
+            layer, column, row = _find_cells(xy[a:b], tangent[a:b], kind[a:b], frame, turn, stride)
+            _blur_layers(picture, layer, is_blurred)
+            score = _correlate(picture, layer, column, row, radius)
             if turn == 0.0:
                 at_rest = score[radius, radius]
                 best = max(best, at_rest)
@@ -206,25 +215,20 @@ def find_best_shifts(
 
 
 @njit(cache=True, nogil=True)
-def _draw_layers(
+def _count_points(
     pose: F64x1, agent: int, others: DrawnPoints, frame: _RasterFrame
 ) -> F32x3:  # pragma: no cover - compiled
-    """Draw the points of other agents in the frame of a pose: (layers, nx, ny) of s."""
-    keys, start, rxy, rtangent, ragent = others
+    """Count the points of other agents in the frame of a pose: (layers, nx, ny), each point in two layers of heading."""
+    keys, start, rxy, heading, ragent = others
     x0, y0, nx, ny, cell = frame
-    picture = np.zeros((24, nx, ny), np.float32)
-    stamp = np.empty((5, 5), np.float32)
-    for i in range(5):
-        for j in range(5):
-            # 0.8: a line sampled once a metre gives about 1 on it.
-            stamp[i, j] = 0.8 * np.exp(-0.5 * ((i - 2) ** 2 + (j - 2) ** 2))
-    c, s = np.cos(pose[2]), np.sin(pose[2])
+    picture, one = np.zeros((NUM_LAYERS, nx, ny), np.float32), np.float32(1.0)
+    c, s, turn = np.cos(pose[2]), np.sin(pose[2]), pose[2] / np.pi
     cx, cy = x0 + nx * cell / 2, y0 + ny * cell / 2
     wx, wy = c * cx - s * cy + pose[0], s * cx + c * cy + pose[1]
     half = np.hypot(nx, ny) * cell / 2
     ix0, ix1 = int(np.floor((wx - half) / 8.0)), int(np.floor((wx + half) / 8.0))
     iy0, iy1 = int(np.floor((wy - half) / 8.0)), int(np.floor((wy + half) / 8.0))
-    for k in range(4):
+    for k in range(NUM_LAYERS // 6):
         for ix in range(ix0, ix1 + 1):
             low, high = find_cell_range(keys, start, k, ix, iy0, iy1)
             for q in range(low, high):
@@ -233,50 +237,78 @@ def _draw_layers(
                 dx, dy = rxy[q, 0] - pose[0], rxy[q, 1] - pose[1]
                 i = int(np.floor((c * dx + s * dy - x0) / cell))
                 j = int(np.floor((-s * dx + c * dy - y0) / cell))
+                # Two cells on each side hold what spreads there from others.
                 if i < 2 or j < 2 or i >= nx - 2 or j >= ny - 2:
                     continue
-                u = c * rtangent[q, 0] + s * rtangent[q, 1]
-                v = -s * rtangent[q, 0] + c * rtangent[q, 1]
-                heading_bin = (np.arctan2(v, u) / np.pi % 1.0) * 6.0
-                one = int(np.floor(heading_bin)) % 6
-                two = (one + (1 if heading_bin - np.floor(heading_bin) > 0.5 else 5)) % 6
-                for layer in (6 * k + one, 6 * k + two):
-                    for di in range(5):
-                        for dj in range(5):
-                            picture[layer, i + di - 2, j + dj - 2] += stamp[di, dj]
+                sector = (heading[q] - turn) * 6.0
+                below = np.floor(sector)
+                here = int(below - 6.0 * np.floor(below / 6.0))
+                beside = (here + (1 if sector - below > 0.5 else 5)) % 6
+                picture[6 * k + here, i, j] += one
+                picture[6 * k + beside, i, j] += one
     return picture
 
 
 @njit(cache=True, nogil=True)
-def _correlate(
-    picture: F32x3,
-    frame: _RasterFrame,
-    xy: F64x2,
-    tangent: F64x2,
-    kind: I64x1,
-    turn: float,
-    radius: int,
-    stride: int,
-) -> F64x2:  # pragma: no cover - compiled
-    """Compute the mean of s / (s + 1) under the points for each shift (2 radius + 1, 2 radius + 1), after a turn about their
-    mean.
-    """
-    x0, y0, nx, ny, cell = frame
-    score = np.zeros((2 * radius + 1, 2 * radius + 1))
+def _find_cells(
+    xy: F64x2, tangent: F64x2, kind: I64x1, frame: _RasterFrame, turn: float, stride: int
+) -> tuple[I64x1, I64x1, I64x1]:  # pragma: no cover - compiled
+    """Find layer, column and row (N,) of every stride-th point after a turn about the mean of all points."""
+    x0, y0, _, _, cell = frame
     c, s = np.cos(turn), np.sin(turn)
     mx, my = xy[:, 0].mean(), xy[:, 1].mean()
-    count, one = 0, np.float32(1.0)
-    for p in range(0, len(xy), stride):
+    count = (len(xy) + stride - 1) // stride
+    layer, column, row = np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int64)
+    for n in range(count):
+        p = n * stride
         dx, dy = xy[p, 0] - mx, xy[p, 1] - my
-        i = int(np.floor((c * dx - s * dy + mx - x0) / cell))
-        j = int(np.floor((s * dx + c * dy + my - y0) / cell))
+        column[n] = int(np.floor((c * dx - s * dy + mx - x0) / cell))
+        row[n] = int(np.floor((s * dx + c * dy + my - y0) / cell))
         u, v = c * tangent[p, 0] - s * tangent[p, 1], s * tangent[p, 0] + c * tangent[p, 1]
-        layer = 6 * kind[p] + int(np.floor((np.arctan2(v, u) / np.pi % 1.0) * 6.0)) % 6
-        count += 1
+        layer[n] = 6 * kind[p] + int(np.floor((np.arctan2(v, u) / np.pi % 1.0) * 6.0)) % 6
+    return layer, column, row
+
+
+@njit(cache=True, nogil=True)
+def _blur_layers(picture: F32x3, layers: I64x1, is_blurred: Boolx1) -> None:  # pragma: no cover - compiled
+    """Blur the counts of layers that are not blurred yet to s: Gaussian of one cell within two cells, along both axes."""
+    nx, ny = picture.shape[1:]
+    # 0.8: a line sampled once a metre gives about 1 on it.
+    middle, first, second = np.float32(0.8), np.float32(0.8 * np.exp(-0.5)), np.float32(0.8 * np.exp(-2.0))
+    next_row, last_row = np.float32(np.exp(-0.5)), np.float32(np.exp(-2.0))
+    along = np.zeros((nx + 4, ny), np.float32)
+    for layer in layers:
+        if is_blurred[layer]:
+            continue
+        is_blurred[layer] = True
+        for i in range(nx):
+            counts, out = picture[layer, i], along[i + 2]
+            for j in range(2, ny - 2):
+                out[j] = middle * counts[j] + first * (counts[j - 1] + counts[j + 1])
+                out[j] += second * (counts[j - 2] + counts[j + 2])
+            # Counts of the two outer cells are zero.
+            out[0], out[1] = second * counts[2], first * counts[2] + second * counts[3]
+            out[ny - 1], out[ny - 2] = second * counts[ny - 3], first * counts[ny - 3] + second * counts[ny - 4]
+        for i in range(nx):
+            out = picture[layer, i]
+            for j in range(ny):
+                out[j] = along[i + 2, j] + next_row * (along[i + 1, j] + along[i + 3, j])
+                out[j] += last_row * (along[i, j] + along[i + 4, j])
+
+
+@njit(cache=True, nogil=True)
+def _correlate(
+    picture: F32x3, layer: I64x1, column: I64x1, row: I64x1, radius: int
+) -> F64x2:  # pragma: no cover - compiled
+    """Compute the mean of s / (s + 1) under points, whose cells are given, for each shift (2 radius + 1, 2 radius + 1)."""
+    nx, ny = picture.shape[1:]
+    score, one = np.zeros((2 * radius + 1, 2 * radius + 1)), np.float32(1.0)
+    for n in range(len(layer)):
+        i, j = column[n], row[n]
         if i < radius or j < radius or i >= nx - radius or j >= ny - radius:
             continue
         for di in range(2 * radius + 1):
-            row = picture[layer, i + di - radius, j - radius : j + radius + 1]
+            under = picture[layer[n], i + di - radius, j - radius : j + radius + 1]
             for dj in range(2 * radius + 1):
-                score[di, dj] += row[dj] / (row[dj] + one)
-    return score / max(1, count)
+                score[di, dj] += under[dj] / (under[dj] + one)
+    return score / max(1, len(layer))

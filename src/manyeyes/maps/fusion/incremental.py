@@ -21,7 +21,13 @@ from manyeyes._jit import Boolx1, F64x1, F64x2, I64x1, njit, set_row
 from manyeyes.datatypes.map_element import CROSSING, KINDS, STYLES, MapElements, take_rows
 from manyeyes.maps.elements.observation import Observation
 from manyeyes.maps.elements.vector_map import CANDIDATE, PUBLISHED, RETIRED, VectorMap
-from manyeyes.maps.fusion.coarse_search import DrawnPoints, apply_shifts, find_best_shifts, to_searched_observations
+from manyeyes.maps.fusion.coarse_search import (
+    DrawnPoints,
+    apply_shifts,
+    count_half_turns,
+    find_best_shifts,
+    to_searched_observations,
+)
 from manyeyes.maps.fusion.coverage import find_cells_under_lines, find_observed_cells, merge_runs
 from manyeyes.maps.fusion.crossings import compute_convex_hull, compute_overlap
 from manyeyes.maps.fusion.existence import (
@@ -496,9 +502,8 @@ class _StationGrid:
     def coarse_grid(self) -> DrawnPoints:
         """The stations for the coarse search, at their positions when this was first read."""
         grid = build_grid(self.xy[:, 0], self.xy[:, 1], self.rows.evidence.kind, 8.0)
-        return DrawnPoints(
-            grid.keys, grid.offsets, self.xy[grid.order], self.tangent[grid.order], self.observation_of_point
-        )
+        heading = count_half_turns(self.tangent[grid.order])
+        return DrawnPoints(grid.keys, grid.offsets, self.xy[grid.order], heading, self.observation_of_point)
 
     def __len__(self) -> int:
         return len(self.xy)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array
 from scipy.sparse.linalg import LinearOperator, cg
 
+from manyeyes.maps.fusion.drive_factor import DriveFactor
 from manyeyes.maps.fusion.pair_blocks import PairBlocks
 from manyeyes.maps.fusion.sparse_inverse import SymmetricFactor, solve_by_factors
 
@@ -126,22 +127,16 @@ def solve_joint_step(pairs: PairBlocks, priors: JointPriors, scale: float, toler
     if tolerance is None:
         found, factor = solve_by_factors(system.to_matrix().tocsc(), system.right_side)
     else:
-        found = _solve_iteratively(system, tolerance)
+        found = _solve_iteratively(system, priors.chain, tolerance)
     count = 3 * len(priors.correction)
     return JointStep(found[:count].reshape(-1, 3), found[count:].reshape(-1, 3), own_weight, factor)
 
 
-def _solve_iteratively(system: JointSystem, tolerance: float) -> Floats:
-    """Solve by conjugate gradients with the blocks on the diagonal as preconditioner."""
-    apart = system.apart
-    on_diagonal = np.repeat(np.arange(len(apart.indptr) - 1), np.diff(apart.indptr)) == apart.indices
-    inverse = np.linalg.inv(apart.data[on_diagonal])
-
-    def precondition(vector: Floats) -> Floats:
-        return np.einsum("nij,nj->ni", inverse, vector.reshape(-1, 3)).reshape(-1)
-
-    multiply, preconditioner = (LinearOperator(apart.shape, one) for one in (system.multiply, precondition))
-    return cg(multiply, system.right_side, rtol=tolerance, maxiter=MAX_ITERATIONS, M=preconditioner)[0]
+def _solve_iteratively(system: JointSystem, chain: DriveChain, tolerance: float) -> Floats:
+    """Solve by conjugate gradients, preconditioned by all but the couplings between observations."""
+    factor = DriveFactor.of_matrix(system.apart, chain.state, chain.previous >= 0)
+    multiply, precondition = (LinearOperator(system.apart.shape, one) for one in (system.multiply, factor.solve))
+    return cg(multiply, system.right_side, rtol=tolerance, maxiter=MAX_ITERATIONS, M=precondition)[0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,15 +14,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes._jit import F64x1, F64x2, I64x1, njit
-from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, find_cell_range, line_residual
+from manyeyes._jit import F64x1, F64x2, I64x1, njit, set_row
+from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, find_cell_range
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-# Sides of grid cells, no shorter than what a point reaches along its line.
-_SHIFT_CELL_M = 2.5
+_SHIFT_CELL_M = 2.0
+# No shorter than what a point reaches along its line.
 _THIN_CELL_M = 2.0
+# Points are gathered again where mean shift has moved a point so far.
+_SLACK_M = 0.5
 
 
 @dataclass(frozen=True)
@@ -96,30 +98,19 @@ def _shift(
     xy: F64x2, tangent: F64x2, kind: I64x1, points: _WeightedPoints, params: _Kernel, rounds: int
 ) -> tuple[F64x2, F64x2, F64x1]:  # pragma: no cover - compiled
     """Run mean shift along normals: positions (S, 2), unit tangents (S, 2) and density (S,) of the points."""
-    keys, start, rxy, rtangent, rweight = points
-    reach, across, sigma_along, sigma_across, cosine = params
     place, turned, density = xy.copy(), tangent.copy(), np.zeros(len(xy))
-    far = reach * reach + across * across
+    radius = np.hypot(params.half_length_m, params.half_width_m) + _SLACK_M
+    near = np.empty((7, 256))
     for p in range(len(xy)):
         x, y, u, v = xy[p, 0], xy[p, 1], tangent[p, 0], tangent[p, 1]
+        near, count = _gather_near(x, y, int(kind[p]), radius, points, near)
+        from_x, from_y = x, y
         for _ in range(rounds):
-            total, pull, cc, ss = 0.0, 0.0, 0.0, 0.0
-            ix, iy = int(np.floor(x / _SHIFT_CELL_M)), int(np.floor(y / _SHIFT_CELL_M))
-            for dx in range(-1, 2):
-                low, high = find_cell_range(keys, start, int(kind[p]), ix + dx, iy - 1, iy + 1)
-                for q in range(low, high):
-                    ex, ey = rxy[q, 0] - x, rxy[q, 1] - y
-                    if ex * ex + ey * ey > far:
-                        continue
-                    along, aside = line_residual(ex, ey, u, v, rtangent[q, 0], rtangent[q, 1], cosine)
-                    if abs(along) > reach or abs(aside) > across:
-                        continue
-                    w = rweight[q] * np.exp(-0.5 * ((along / sigma_along) ** 2 + (aside / sigma_across) ** 2))
-                    total += w
-                    pull += w * aside
-                    # Doubled angles: a line read backwards is the same line.
-                    cc += w * (2.0 * rtangent[q, 0] * rtangent[q, 0] - 1.0)
-                    ss += w * 2.0 * rtangent[q, 0] * rtangent[q, 1]
+            if np.hypot(x - from_x, y - from_y) > _SLACK_M:
+                near, count = _gather_near(x, y, int(kind[p]), radius, points, near)
+                from_x, from_y = x, y
+            _weigh_near(count, x, y, u, v, params, near)
+            total, pull, cc, ss = _sum_near(count, near)
             if total <= 0.0:
                 break
             density[p] = total
@@ -128,6 +119,78 @@ def _shift(
             u, v = np.cos(angle), np.sin(angle)
         place[p, 0], place[p, 1], turned[p, 0], turned[p, 1] = x, y, u, v
     return place, turned, density
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _gather_near(
+    x: float, y: float, kind: int, radius: float, points: _WeightedPoints, near: F64x2
+) -> tuple[F64x2, int]:  # pragma: no cover - compiled
+    """Gather the points of a kind within a radius: x, y, tangent and weight in the first columns of near (7, N), and N."""
+    low_y, high_y = int(np.floor((y - radius) / _SHIFT_CELL_M)), int(np.floor((y + radius) / _SHIFT_CELL_M))
+    n = 0
+    for ix in range(int(np.floor((x - radius) / _SHIFT_CELL_M)), int(np.floor((x + radius) / _SHIFT_CELL_M)) + 1):
+        low, high = find_cell_range(points.keys, points.start, kind, ix, low_y, high_y)
+        if n + high - low > near.shape[1]:
+            bigger = np.empty((7, 2 * (n + high - low)))
+            for column in range(5):
+                set_row(bigger[column, :n], near[column, :n])
+            near = bigger
+        for q in range(low, high):
+            ex, ey = points.xy[q, 0] - x, points.xy[q, 1] - y
+            near[0, n], near[1, n] = points.xy[q, 0], points.xy[q, 1]
+            near[2, n], near[3, n], near[4, n] = points.tangent[q, 0], points.tangent[q, 1], points.weight[q]
+            # A point that is too far is overwritten by the next one, which is faster than a branch.
+            n += 1 if ex * ex + ey * ey <= radius * radius else 0
+    return near, n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _weigh_near(
+    n: int, x: float, y: float, u: float, v: float, params: _Kernel, near: F64x2
+) -> None:  # pragma: no cover - compiled
+    """Set lateral offset and kernel weight, the last two columns of near, of its n points around a place with tangent (u, v).
+
+    Residuals are those of :func:`~manyeyes.maps.fusion.point_grid.line_residual`, without branches, so that the loop is vectorised.
+    """
+    other_x, other_y, tangent_x, tangent_y, weight = near[0], near[1], near[2], near[3], near[4]
+    offsets, weights = near[5], near[6]
+    reach, across, cosine = params.half_length_m, params.half_width_m, params.min_cosine
+    along_scale, aside_scale = 0.0625 / params.longitudinal_sigma_m**2, 0.0625 / params.lateral_sigma_m**2
+    for k in range(n):
+        dx, dy = other_x[k] - x, other_y[k] - y
+        dot = u * tangent_x[k] + v * tangent_y[k]
+        sign = 1.0 if dot > 0.0 else -1.0
+        norm = np.sqrt(2.0 + 2.0 * abs(dot))
+        mx, my = (u + sign * tangent_x[k]) / norm, (v + sign * tangent_y[k]) / norm
+        along, aside = dx * mx + dy * my, dy * mx - dx * my
+        # exp(-8 t) as the eighth power of the series of exp(-t), right to 1e-7 within the kernel.
+        t = along * along * along_scale + aside * aside * aside_scale
+        e = 1.0 - t * (1.0 / 8.0)
+        e = 1.0 - t * (1.0 / 7.0) * e
+        e = 1.0 - t * (1.0 / 6.0) * e
+        e = 1.0 - t * (1.0 / 5.0) * e
+        e = 1.0 - t * (1.0 / 4.0) * e
+        e = 1.0 - t * (1.0 / 3.0) * e
+        e = 1.0 - t * (1.0 / 2.0) * e
+        e = 1.0 - t * e
+        e *= e
+        e *= e
+        w = weight[k] * e * e
+        weights[k] = w if (abs(dot) >= cosine) & (abs(along) <= reach) & (abs(aside) <= across) else 0.0
+        offsets[k] = aside
+
+
+@njit(cache=True, nogil=True)
+def _sum_near(n: int, near: F64x2) -> tuple[float, float, float, float]:  # pragma: no cover - compiled
+    """Sum weights, lateral offsets and doubled tangents of n weighted points: a line read backwards is the same line."""
+    total, pull, cc, ss = 0.0, 0.0, 0.0, 0.0
+    for k in range(n):
+        u, w = near[2, k], near[6, k]
+        total += w
+        pull += w * near[5, k]
+        cc += w * (2.0 * u * u - 1.0)
+        ss += w * 2.0 * u * near[3, k]
+    return total, pull, cc, ss
 
 
 def thin_ridges(

@@ -199,8 +199,8 @@ def _only(options: StudyOptions, cell: TableCell, contender: Contender) -> Study
 
 
 def make_comparisons(results: ResultGrid, keys: dict[tuple[TableCell, Contender], ResultKey]) -> Iterator[Comparison]:
-    """Compare our method with every other of its form under each condition, at the sweep and at the answer; and ours with and
-    without each corrector.
+    """Compare our method with every other of its form under each condition, at the sweep and at the answer; ours with and without
+    each corrector; and ours under each disturbance with itself where nothing is wrong.
     """
     alone = {c: key for (_, c), key in keys.items() if c.method in ALONE}
     for (cell, ours), key in keys.items():
@@ -217,6 +217,10 @@ def make_comparisons(results: ResultGrid, keys: dict[tuple[TableCell, Contender]
         if cell.corrector != OFF and without is not None:
             text = f"{ours.name}, {cell.name} - {OFF}"
             yield from (results.compare(text, key, without, iou) for iou in (0, 1))
+        undisturbed = keys.get((replace(cell, perturbation=CLEAN), ours))
+        if cell.perturbation != CLEAN and undisturbed is not None:
+            text = f"{ours.name}, {cell.name} - {CLEAN.name}"
+            yield from (results.compare(text, key, undisturbed, iou) for iou in (0, 1))
 
 
 def _is_beside(at: TableCell, cell: TableCell, contender: Contender) -> bool:
