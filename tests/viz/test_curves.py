@@ -75,3 +75,11 @@ def test_the_legend_of_one_panel_is_not_cut_off(tmp_path) -> None:
     pixels = drawn([CurvePanel("Reliability", "score", "fraction", curves)], tmp_path / "x.png")
     legend = pixels[-75:]
     assert (legend[:, :4] == 255).all() and (legend[:, -4:] == 255).all() and (legend < 255).any()
+
+
+def test_no_two_of_many_labels_are_drawn_alike() -> None:
+    labels = [f"method {k}" for k in range(23)]
+    axes = Figure().add_subplot()
+    curves._draw(axes, CurvePanel("", "", "AP", tuple(Curve(n, at(0.5, 0.6), (0.0, 1.0)) for n in labels)), labels)
+    styles = {(line.get_color(), line.get_marker()) for line in axes.get_lines()}
+    assert len(axes.get_lines()) == len(styles) == len(labels)

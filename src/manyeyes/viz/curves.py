@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Curves of a study with their 95 % intervals, panels side by side, one colour a label throughout."""
+"""Curves of a study with their 95 % intervals, panels side by side, one colour and marker a label throughout."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ _LEGEND_COLUMNS = 3
 """Names side by side below each panel."""
 _MAX_UPRIGHT_LETTERS = 40
 """Letters below an axis beyond which names are written aslant."""
+_NUM_COLOURS = 10
+_MARKERS = "os^Dvx"
+"""Of labels that have the same colour."""
 _BYTES_TICKS = (1 << 9, 1 << 11, 1 << 13, 1 << 15, 1 << 17, 1 << 19)
 
 
@@ -79,13 +82,14 @@ def _draw(axes: Axes, panel: CurvePanel, labels: Sequence[str]) -> None:
     from matplotlib.ticker import MaxNLocator
 
     for curve in panel.curves:
-        colour = f"C{labels.index(curve.label) % 10}"
+        lap, number = divmod(labels.index(curve.label), _NUM_COLOURS)
+        colour, marker = f"C{number}", _MARKERS[lap % len(_MARKERS)]
         if not curve.x:
             axes.axhline(curve.y[0].value, color=colour, lw=1.2, ls="--", label=curve.label)
             continue
         order = sorted(range(len(curve.x)), key=lambda i: curve.x[i])
         x, y = [curve.x[i] for i in order], [curve.y[i] for i in order]
-        axes.plot(x, [v.value for v in y], color=colour, marker="o", ms=4, lw=1.6, label=curve.label)
+        axes.plot(x, [v.value for v in y], color=colour, marker=marker, ms=4, lw=1.6, ls="-" if lap == 0 else "-.", label=curve.label)
         if any(v.num_scenarios > 1 for v in y):
             axes.fill_between(x, [v.low for v in y], [v.high for v in y], color=colour, alpha=0.15, lw=0)
     axes.set(xlabel=panel.xlabel, ylabel=panel.ylabel)
