@@ -89,7 +89,16 @@ def _draw(axes: Axes, panel: CurvePanel, labels: Sequence[str]) -> None:
             continue
         order = sorted(range(len(curve.x)), key=lambda i: curve.x[i])
         x, y = [curve.x[i] for i in order], [curve.y[i] for i in order]
-        axes.plot(x, [v.value for v in y], color=colour, marker=marker, ms=4, lw=1.6, ls="-" if lap == 0 else "-.", label=curve.label)
+        axes.plot(
+            x,
+            [v.value for v in y],
+            color=colour,
+            marker=marker,
+            ms=4,
+            lw=1.6,
+            ls="-" if lap == 0 else "-.",
+            label=curve.label,
+        )
         if any(v.num_scenarios > 1 for v in y):
             axes.fill_between(x, [v.low for v in y], [v.high for v in y], color=colour, alpha=0.15, lw=0)
     axes.set(xlabel=panel.xlabel, ylabel=panel.ylabel)
