@@ -106,7 +106,7 @@ def _solve_chain(
     biases: F64x2,
 ) -> None:  # pragma: no cover - compiled
     """Replace right sides of poses (O, 3) and biases (S, 3) by the solution."""
-    moved = np.empty(3)
+    moved, pulled = np.empty(3), np.empty(3)
     for o in range(len(poses)):
         _multiply(pose_inverse[o], poses[o], moved)
         bias = biases[state[o]]
@@ -126,13 +126,10 @@ def _solve_chain(
         for i in range(3):
             biases[s, i] = moved[i]
     for o in range(len(poses)):
-        pulled = coupling[o]
-        bias = biases[state[o]]
-        x = pulled[0, 0] * bias[0] + pulled[0, 1] * bias[1] + pulled[0, 2] * bias[2]
-        y = pulled[1, 0] * bias[0] + pulled[1, 1] * bias[1] + pulled[1, 2] * bias[2]
-        t = pulled[2, 0] * bias[0] + pulled[2, 1] * bias[1] + pulled[2, 2] * bias[2]
+        _multiply(coupling[o], biases[state[o]], pulled)
+        _multiply(pose_inverse[o], pulled, moved)
         for i in range(3):
-            poses[o, i] -= pose_inverse[o, i, 0] * x + pose_inverse[o, i, 1] * y + pose_inverse[o, i, 2] * t
+            poses[o, i] -= moved[i]
 
 
 @njit(cache=True, nogil=True)
