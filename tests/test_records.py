@@ -13,7 +13,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from manyeyes._records import load_record, save_record
+from manyeyes._records import load_record, pack_record, save_record, unpack_record
 
 
 class Colour(Enum):
@@ -65,6 +65,24 @@ def test_a_value_round_trips(tmp_path) -> None:
     for a, b in ((got.table, want.table), (got.corner.points, want.corner.points), (got.empty, want.empty)):
         np.testing.assert_array_equal(a, b)
         assert (a.dtype, a.shape, a.strides, a.flags.writeable) == (b.dtype, b.shape, b.strides, b.flags.writeable)
+
+
+def test_bytes_in_memory_equal_the_file_and_read_only_arrays_are_views_of_them(tmp_path) -> None:
+    want = make_whole()
+    save_record(tmp_path / "x.record", want)
+    data = pack_record(want)
+    assert data == (tmp_path / "x.record").read_bytes()
+    got = unpack_record(data, Whole)
+    assert got is not None
+    for a, b in ((got.table, want.table), (got.corner.points, want.corner.points), (got.empty, want.empty)):
+        np.testing.assert_array_equal(a, b)
+        assert (a.dtype, a.shape, a.strides, a.flags.writeable) == (b.dtype, b.shape, b.strides, b.flags.writeable)
+        assert a.flags.aligned
+    stored = np.frombuffer(data, np.uint8)
+    assert np.shares_memory(got.table, stored) and not np.shares_memory(got.corner.points, stored)
+    for at in range(0, len(data), 7):
+        assert unpack_record(data[:at], Whole) is None, f"cut at {at}"
+        assert unpack_record(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :], Whole) is None, f"changed at {at}"
 
 
 def test_a_tuple_of_values_round_trips(tmp_path) -> None:

@@ -2,12 +2,14 @@
 """Frozen dataclasses and named tuples as files: numbers and texts as JSON, arrays and tensors as bytes behind it.
 
 Which arrays are read-only is kept, as compiled loops have one version for those and one for others. A checksum covers every part.
+Arrays begin at multiples of 16 bytes, so that read-only ones of bytes in memory are views of them.
 """
 
 from __future__ import annotations
 
 import io
 import json
+import math
 import types
 import zlib
 from dataclasses import fields, is_dataclass
@@ -23,6 +25,7 @@ from manyeyes._io import atomic_write
 T = TypeVar("T")
 
 _PLAIN = (str, int, float, bool)
+_ALIGNMENT = 16
 
 
 def save_record(path: Path, value: object, durable: bool = False) -> None:
@@ -41,7 +44,13 @@ def pack_record(value: object) -> bytes:
 def _chunks_of(value: object) -> list[bytes | memoryview]:
     arrays: list[np.ndarray] = []
     header = json.dumps(_pack(value, arrays)).encode()
-    return [b"%08x" % zlib.crc32(header), header, b"\n", *(_bytes_of(array) for array in arrays if array.size)]
+    chunks: list[bytes | memoryview] = [b"%08x" % zlib.crc32(header), header, b"\n"]
+    length = len(header) + 9
+    for array in arrays:
+        if array.size:
+            chunks += [bytes(-length % _ALIGNMENT), _bytes_of(array)]
+            length += -length % _ALIGNMENT + array.nbytes
+    return chunks
 
 
 def load_record(path: Path, kind: type[T]) -> T | None:
@@ -54,8 +63,25 @@ def load_record(path: Path, kind: type[T]) -> T | None:
 
 
 def unpack_record(data: bytes, kind: type[T]) -> T | None:
-    """Return the value of bytes of :func:`pack_record`; None for damaged ones, or ones of another type."""
-    return _read_record(io.BytesIO(data), kind)
+    """Return the value of bytes of :func:`pack_record`; None for damaged ones, or ones of another type.
+
+    Read-only arrays are views of the bytes.
+    """
+    return _read_record(_Memory(data), kind)
+
+
+class _Memory(io.BytesIO):
+    """Bytes as a file that hands out views of them."""
+
+    def __init__(self, data: bytes) -> None:
+        super().__init__(data)
+        self._data = data
+
+    def view(self, shape: Any, dtype: np.dtype[Any]) -> np.ndarray:
+        """Return a read-only array of the bytes that are next; ValueError where they are not enough."""
+        array = np.frombuffer(self._data, dtype, math.prod(shape), self.tell()).reshape(shape)
+        self.seek(array.nbytes, io.SEEK_CUR)
+        return array
 
 
 def _read_record(file: io.BufferedIOBase, kind: type[T]) -> T | None:
@@ -115,9 +141,16 @@ def _unpack(hint: Any, packed: Any, file: io.BufferedIOBase) -> Any:
 
 def _read_array(packed: Any, file: io.BufferedIOBase) -> np.ndarray:
     dtype, shape, is_transposed, writeable, checksum = packed
-    array = np.empty(shape, np.dtype(dtype))
-    stored = array.reshape(-1).view(np.uint8).data
-    if file.readinto(stored) != array.nbytes or zlib.crc32(stored) != checksum:
+    size = math.prod(shape)
+    if size and any(file.read(-file.tell() % _ALIGNMENT)):
+        raise ValueError("damaged")
+    if size and not writeable and isinstance(file, _Memory):
+        array = file.view(shape, np.dtype(dtype))
+    else:
+        array = np.empty(shape, np.dtype(dtype))
+        if file.readinto(array.reshape(-1).view(np.uint8).data) != array.nbytes:
+            raise ValueError("damaged")
+    if zlib.crc32(array.reshape(-1).view(np.uint8).data) != checksum:
         raise ValueError("damaged")
     array = array.T if is_transposed else array
     array.flags.writeable = writeable

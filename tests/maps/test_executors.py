@@ -3,9 +3,11 @@
 
 import contextlib
 import os
+import platform
 import sys
 import time
 
+import numpy as np
 import pytest
 
 from manyeyes.datatypes import ConfigError, MissingExtraError
@@ -47,6 +49,22 @@ def test_a_process_pool_gives_the_inline_list_in_block_order_and_reports_every_b
     assert os.getpid() not in {pid for _, pid in results}
     assert {pid for _, pid in again} <= {pid for _, pid in results}
     assert seen == [(k, 9) for k in range(1, 10)]
+
+
+def _count_page_faults(value: int) -> int:
+    """Page faults while large arrays are made and freed, once the first is there."""
+    import resource
+
+    np.ones(4_000_000)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(20):
+        np.ones(4_000_000)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="memory is kept with glibc alone")
+def test_a_worker_uses_the_memory_of_a_freed_array_again():
+    assert _run(ProcessExecutor(1), _count_page_faults, [0])[0] < 100
 
 
 @pytest.mark.parametrize("executor", [InlineExecutor(), ProcessExecutor(2)], ids=["inline", "process"])

@@ -22,7 +22,7 @@ def make_sums(rng):
         np.frombuffer(bytes.fromhex(IDS[o]), np.uint8) if o < len(IDS) else np.full(16, 7, np.uint8) for o in numbers
     ]
     offsets = np.cumsum([0, *(len(others) for _, others in MET)])
-    return PairSums(rng.normal(size=(len(IDS), 11)), offsets, np.array(digests), rng.normal(size=(len(numbers), 18)))
+    return PairSums(rng.normal(size=(len(IDS), 11)), offsets, np.array(digests), rng.normal(size=(len(numbers), 12)))
 
 
 def fill_densely(sums):
@@ -41,11 +41,12 @@ def fill_densely(sums):
     for row, others in MET:
         for o in others:
             if o < len(IDS):
-                block = sums.shared[n, :9].reshape(3, 3)
+                xx, xy, yy, xu, yu, uu, tx, ty, tu = sums.shared[n, :9]
+                block = -np.array([[xx, xy, xu], [xy, yy, yu], [tx, ty, tu]])
                 dense[3 * row : 3 * row + 3, 3 * o : 3 * o + 3] += block
                 dense[3 * o : 3 * o + 3, 3 * row : 3 * row + 3] += block.T
-                add_symmetric(own[o], sums.shared[n, 9:15])
-                right[o] += sums.shared[n, 15:18]
+                add_symmetric(own[o], (xx, xy, xu, yy, yu, uu))
+                right[o] -= sums.shared[n, 9:]
             n += 1
     return dense, own, right
 
@@ -66,7 +67,7 @@ def test_blocks_equal_those_of_a_dense_matrix_filled_pair_by_pair():
 
 
 def test_blocks_of_observations_that_meet_no_other():
-    empty = PairSums(np.ones((2, 11)), np.zeros(3, np.int64), np.zeros((0, 16), np.uint8), np.zeros((0, 18)))
+    empty = PairSums(np.ones((2, 11)), np.zeros(3, np.int64), np.zeros((0, 16), np.uint8), np.zeros((0, 12)))
     blocks = PairBlocks.of_sums(empty, IDS[:2])
     assert blocks.other.shape == (0,) and blocks.coupling.shape == (0, 3, 3)
     assert (blocks.multiply(np.ones((2, 3))) == 0.0).all()

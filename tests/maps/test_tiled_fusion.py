@@ -282,3 +282,41 @@ def test_what_the_driver_holds_grows_by_names_of_blocks_alone(tmp_path):
     assert blocks[0] < 40 and blocks[1] > 100
     # An observation with its id and place takes some 300 bytes; a block of this density holds 25, a dense one thousands.
     assert (peaks[1] - peaks[0]) / (blocks[1] - blocks[0]) < 5000
+
+
+class Recorder(NoWork):
+    """An engine that keeps the tasks in the order in which they begin."""
+
+    def __init__(self):
+        self.tasks = []
+
+    def run(self, _, tasks):
+        def kept():
+            for task in tasks:
+                self.tasks.append(task)
+                yield task
+
+        return super().run(_, kept())
+
+
+def test_the_largest_tasks_of_a_step_begin_first_and_agents_are_added_in_one_order(tmp_path):
+    """The farther east, the more observations a block has; sums must not depend on which domain is the largest."""
+    index = LogIndex(tmp_path / "index.sqlite")
+    index.clear("")
+    places = [(512.0 * column + 5.0 * k, 100.0) for column in range(12) for k in range(3 + 4 * column)]
+    rows = [IndexRow(f"{k:032x}", k // 128, k, f"car{k % 7}", x, y, 51.0, "p") for k, (x, y) in enumerate(places)]
+    index.add_segment("1.parquet", rows)
+    job, engine = FusionJob(NoWork(), NoWork(), MapFusionConfig()), Recorder()
+    keys = fuse_and(tuple, job, index, TiledFusionConfig(), engine)
+    size = {block.place: len(block.observations) for block in iterate_blocks(index, TiledFusionConfig())}
+    for kind in ("search", "pairs", "stations"):
+        sizes = [size[task.place] for task in engine.tasks if task.kind == kind and task.number == 0]
+        assert len(set(sizes)) > 5 and sizes == sorted(sizes, reverse=True)
+    solved = [task.place for task in engine.tasks if task.kind == "solve" and task.number == 0]
+    assert len(solved) > 3 and solved[0] != min(solved) and solved[-1] == min(solved)
+    weighed = next(task for task in engine.tasks if task.kind == "weigh")
+    linked = [task for task in engine.tasks if task.kind == "link"]
+    for names in (weighed.inputs, keys):
+        in_order = [tuple(map(int, name.split("/")[2].split("_"))) for name in names]
+        assert len(in_order) > 3 and in_order == sorted(in_order)
+    assert [task.place for task in linked] != sorted(task.place for task in linked)

@@ -18,6 +18,9 @@ Ints = NDArray[np.int64]
 
 # Of the upper triangle (xx, xy, xt, yy, yt, tt), the entries of a symmetric matrix in order of rows.
 _SYMMETRIC = [0, 1, 2, 1, 3, 4, 2, 4, 5]
+# Of what a pair shares, the entries in order of rows of the other observation's block, and of the block between both, negative.
+_OTHER = np.array([0, 1, 3, 1, 2, 4, 3, 4, 5])
+_BETWEEN = np.array([0, 1, 3, 1, 2, 4, 6, 7, 8])
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,18 +67,10 @@ def _add_others(other: I64x1, shared: F64x2, own: F64x3, right_side: F64x2) -> N
     for k in range(len(other)):
         if other[k] >= 0:
             block, right, row = own[other[k]], right_side[other[k]], shared[k]
-            block[0, 0] += row[9]
-            block[0, 1] += row[10]
-            block[0, 2] += row[11]
-            block[1, 0] += row[10]
-            block[1, 1] += row[12]
-            block[1, 2] += row[13]
-            block[2, 0] += row[11]
-            block[2, 1] += row[13]
-            block[2, 2] += row[14]
-            right[0] += row[15]
-            right[1] += row[16]
-            right[2] += row[17]
+            for m in range(3):
+                right[m] -= row[9 + m]
+                for n in range(3):
+                    block[m, n] += row[_OTHER[3 * m + n]]
 
 
 @njit(cache=True, nogil=True)
@@ -122,11 +117,11 @@ def _merge_directions(
             if later[i] == other[pair[i]]:
                 for m in range(3):
                     for n in range(3):
-                        block[m, n] += sums[3 * m + n]
+                        block[m, n] -= sums[_BETWEEN[3 * m + n]]
             else:
                 for m in range(3):
                     for n in range(3):
-                        block[m, n] += sums[3 * n + m]
+                        block[m, n] -= sums[_BETWEEN[3 * n + m]]
     return first, merged, coupling
 
 

@@ -22,7 +22,7 @@ from manyeyes.ops._sort_kernels import sort
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-NUM_OWN, NUM_SHARED, NUM_SUMS = 11, 18, 14
+NUM_OWN, NUM_SHARED, NUM_SUMS = 11, 12, 14
 
 
 class OwnPoints(NamedTuple):
@@ -122,7 +122,7 @@ def sum_pairs(
             row = sums[slot[order[i]]]
             _add_own(own[h], row)
             other[filled] = order[i]
-            _set_shared(shared[filled], row)
+            set_row(shared[filled], row[:NUM_SHARED])
             filled += 1
         for i in range(n):
             slot[met[i]] = -1
@@ -169,29 +169,6 @@ def _add_own(own: F64x1, row: F64x1) -> None:  # pragma: no cover - compiled
     own[6] += row[9]
     own[7] += row[10]
     own[8] += row[13]
-
-
-@njit(cache=True, nogil=True)
-def _set_shared(shared: F64x1, row: F64x1) -> None:  # pragma: no cover - compiled
-    """Set shared from sums of :func:`_add_pair`."""
-    shared[0] = -row[0]
-    shared[1] = -row[1]
-    shared[2] = -row[3]
-    shared[3] = -row[1]
-    shared[4] = -row[2]
-    shared[5] = -row[4]
-    shared[6] = -row[6]
-    shared[7] = -row[7]
-    shared[8] = -row[8]
-    shared[9] = row[0]
-    shared[10] = row[1]
-    shared[11] = row[3]
-    shared[12] = row[2]
-    shared[13] = row[4]
-    shared[14] = row[5]
-    shared[15] = -row[9]
-    shared[16] = -row[10]
-    shared[17] = -row[11]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

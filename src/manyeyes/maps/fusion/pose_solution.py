@@ -26,7 +26,8 @@ class PairSums:
 
     own: (O, 11) upper triangle (xx, xy, xt, yy, yt, tt) and right side (x, y, t) of the observation's own block, weighted sum of
     squared residuals (m²), sum of votes of its points. offsets: (O + 1,) of the pairs. other_ids: (N, 16) observation of each pair.
-    shared: (N, 18) of each pair: block between both (3, 3), then upper triangle and right side of the other observation.
+    shared: (N, 12) of each pair: xx, xy, yy, xt', yt', t't', tx, ty, tt' and right side (x, y, t'), t' by the heading of the other
+        observation; the right side of that one, and the block between both, are the negative of these.
     """
 
     own: Floats

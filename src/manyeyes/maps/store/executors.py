@@ -9,6 +9,8 @@ depend on which one did, in which order, or on how many workers.
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import itertools
 import logging
 import multiprocessing
@@ -111,7 +113,7 @@ class ProcessExecutor:
         if clean:
             context.set_forkserver_preload([__name__])
         workers = self.workers or _available_cores()
-        with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        with ProcessPoolExecutor(workers, mp_context=context, initializer=_keep_freed_memory) as pool:
             try:
                 yield _ProcessSession(pool, workers * BLOCKS_PER_WORKER)
             except BaseException:
@@ -270,6 +272,20 @@ def map_blocks(
         if progress is not None:
             progress(len(results), len(blocks))
     return [results[index] for index in range(len(blocks))]
+
+
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4  # of glibc's malloc.h
+
+
+def _keep_freed_memory() -> None:
+    """Keep freed memory in this process, where its C library is glibc.
+
+    Otherwise each large array is given back to the system, which clears the pages of the next one again.
+    """
+    with contextlib.suppress(OSError, AttributeError, TypeError):
+        set_option = ctypes.CDLL(None).mallopt
+        set_option(_M_MMAP_MAX, 0)
+        set_option(_M_TRIM_THRESHOLD, 2**31 - 1)
 
 
 def _available_cores() -> int:

@@ -118,12 +118,13 @@ class FusionJob:
 @dataclass(frozen=True)
 class _Plan:
     """What this process knows of a block: the key of its TileBlock, and the domains that the observations it reads are at home in;
-    home_domains: of its own.
+    home_domains: of its own. size: how many observations it reads.
     """
 
     place: Place
     area: Area
     members: str
+    size: int
     domains: tuple[Place, ...]
     home_domains: tuple[Place, ...]
 
@@ -229,7 +230,7 @@ def iterate_blocks(index: LogIndex, tile_config: TiledFusionConfig) -> Iterator[
 
 
 def _make_plans(job: FusionJob, index: LogIndex, tile_config: TiledFusionConfig) -> list[_Plan]:
-    """Write what each block reads to the job's work, and plan the blocks."""
+    """Write what each block reads to the job's work, and plan the blocks, the largest first."""
     plans = []
     for block in iterate_blocks(index, tile_config):
         folder = f"{WORK}/block/{block.place[0]}_{block.place[1]}"
@@ -241,16 +242,17 @@ def _make_plans(job: FusionJob, index: LogIndex, tile_config: TiledFusionConfig)
                 block.place,
                 block.area,
                 key,
+                len(xy),
                 tuple(list_domains(xy, solver)),
                 tuple(list_domains(xy[home], solver)) if home.any() else (),
             )
         )
-    return plans
+    return sorted(plans, key=lambda plan: (-plan.size, plan.place))
 
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """One pass over all steps."""
+    """One pass over all steps. Of each step the largest tasks begin first, so that workers end it together."""
 
     job: FusionJob
     plans: list[_Plan]
@@ -294,7 +296,8 @@ class _Run:
             tasks = (task("solve", d, number, tuple(pairs[b] for b in domains[d])) for d in domains)
             solved = self._map(name, tasks, total, len(homes))
             poses = dict(zip(domains, (keys[0] for keys in solved)))
-            agents = self._weigh(number, [keys[1] for keys in solved], agents)
+            sums = dict(zip(domains, (keys[1] for keys in solved)))
+            agents = self._weigh(number, [sums[place] for place in sorted(sums)], agents)
         tasks = (task("stations", p.place, 0, read_by(p), agents) for p in self.plans)
         stations = [keys[0] for keys in self._map("stations", tasks, len(self.plans))]
         made_from = [(agents, *read_by(p)) for p in self.plans]
@@ -303,7 +306,8 @@ class _Run:
             task("link", block, 0, tuple(stations[k] for k in rows), "", tuple(made_from[k] for k in rows))
             for block, rows in blocks.items()
         )
-        return tuple(keys[0] for keys in self._map("link", tasks, len(blocks)))
+        linked = dict(zip(blocks, (keys[0] for keys in self._map("link", tasks, len(blocks)))))
+        return tuple(linked[block] for block in sorted(linked))
 
     def _blocks_to_link(self) -> dict[Place, tuple[int, ...]]:
         """Return the blocks in which stations are linked, each with the plans whose stations may lie within its halo."""
@@ -317,18 +321,18 @@ class _Run:
                 range(int((low - halo) // side), int((high + halo) // side) + 1) for low, high in ((x0, x1), (y0, y1))
             )
             out[block] = tuple(rows[place] for place in product(columns, lines) if place in rows)
-        return out
+        return _sort_by_size(out, lambda row: self.plans[row].size)
 
     def _blocks_of_domains(self, homes: Sequence[_Plan]) -> dict[Place, tuple[Place, ...]]:
         """Return the blocks whose home observations may lie within the halo of each domain, by column and row."""
-        known, side = {p.place for p in homes}, self.tile_config.block_m
+        known, side = {p.place: p.size for p in homes}, self.tile_config.block_m
         solver = self.job.config.pose_solver
         out = {}
         for domain in sorted({d for p in homes for d in p.home_domains}):
             x0, y0, x1, y1 = find_domain_area(domain, solver)
             ranges = (range(int(low // side), int(high // side) + 1) for low, high in ((x0, x1), (y0, y1)))
             out[domain] = tuple(place for place in product(*ranges) if place in known)
-        return out
+        return _sort_by_size(out, known.__getitem__)
 
     def _weigh(self, number: int, sums: list[str], agents: str) -> str:
         """Add the sums of all domains level by level, and weigh the agents; returns the key of their table."""
@@ -353,6 +357,12 @@ class _Run:
         if failures:
             raise FailedObservationsError(failures)
         return [keys[index] for index in range(len(keys))]
+
+
+def _sort_by_size(parts: dict[Place, tuple[T, ...]], size_of: Callable[[T], int]) -> dict[Place, tuple[T, ...]]:
+    """Return places with their parts, those with the largest sum of sizes first."""
+    sizes = {place: sum(map(size_of, found)) for place, found in parts.items()}
+    return {place: parts[place] for place in sorted(parts, key=lambda place: (-sizes[place], place))}
 
 
 _NUM_RESULTS = {"solve": 2}
