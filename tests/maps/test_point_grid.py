@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from manyeyes.maps.fusion.point_grid import (
     build_grid,
+    cell_key,
     hash_coordinates,
     limit_observations,
     lower_bound,
@@ -62,3 +64,15 @@ def test_priorities_depend_on_coordinates_alone():
     assert (hash_coordinates(xy[::-1])[::-1] == priority).all() and len(np.unique(priority)) == 1000
     assert (hash_coordinates(np.array([[0.0, -0.0]])) == hash_coordinates(np.zeros((1, 2)))).all()
     assert abs(np.corrcoef(priority.astype(np.float64), xy[:, 0])[0, 1]) < 0.15
+
+
+@pytest.mark.parametrize(("count", "extent_m"), [(0, 1.0), (1, 1.0), (5000, 20.0), (500, 1e6), (500, 5e8)])
+def test_cells_are_sorted_stably_whatever_their_extent(count, extent_m):
+    """The widest one has more pairs of cell and point than an integer can number."""
+    rng = np.random.default_rng(4)
+    x, y = rng.uniform(-extent_m, extent_m, (2, count))
+    kind = rng.integers(0, 4, count)
+    grid, key = build_grid(x, y, kind, 1.0), cell_key(kind, x, y, 1.0)
+    np.testing.assert_array_equal(grid.order, np.argsort(key, kind="stable"))
+    np.testing.assert_array_equal(grid.keys, np.unique(key))
+    np.testing.assert_array_equal(np.diff(grid.offsets), np.unique(key, return_counts=True)[1])

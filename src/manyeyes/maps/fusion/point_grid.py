@@ -37,10 +37,23 @@ class PointGrid(NamedTuple):
 def build_grid(x: Floats, y: Floats, kind: Ints, cell_m: float) -> PointGrid:
     """Sort points (P,) into a grid of cells of cell_m; within a cell the points keep their order."""
     key = cell_key(kind, x, y, cell_m)
-    order = np.argsort(key, kind="stable")
+    order = _argsort_cells(key)
     ordered = key[order]
     begins = np.flatnonzero(np.concatenate((np.ones(min(1, len(key)), bool), ordered[1:] != ordered[:-1])))
     return PointGrid(cell_m, ordered[begins], np.concatenate((begins, [len(key)])).astype(np.int64), order)
+
+
+def _argsort_cells(key: Ints) -> Ints:
+    """Return the stable order (P,) of keys of cells: numbers of cell and point in one are sorted several times as fast."""
+    part = (1 << _SHIFT) - 1
+    number = np.zeros(len(key), np.int64)
+    for shift in (2 * _SHIFT, _SHIFT, 0):
+        column = (key >> shift) & part
+        low = column.min(initial=part)
+        number = number * (column.max(initial=low) - low + 1) + column - low
+    if number.max(initial=0) >= np.iinfo(np.int64).max // max(len(key), 1) - 1:
+        return np.argsort(key, kind="stable")
+    return np.sort(number * len(key) + np.arange(len(key))) % max(len(key), 1)
 
 
 def cell_key(kind: Ints, x: Floats, y: Floats, cell_m: float) -> Ints:
