@@ -44,7 +44,7 @@ def build_grid(x: Floats, y: Floats, kind: Ints, cell_m: float) -> PointGrid:
 
 
 def _argsort_cells(key: Ints) -> Ints:
-    """Return the stable order (P,) of keys of cells: numbers of cell and point in one are sorted several times as fast."""
+    """Return the stable order (P,) of keys of cells by sorting one number of cell and point, unless these exceed an integer."""
     part = (1 << _SHIFT) - 1
     number = np.zeros(len(key), np.int64)
     for shift in (2 * _SHIFT, _SHIFT, 0):

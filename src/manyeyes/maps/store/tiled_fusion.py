@@ -310,7 +310,7 @@ class _Run:
         return tuple(linked[block] for block in sorted(linked))
 
     def _blocks_to_link(self) -> dict[Place, tuple[int, ...]]:
-        """Return the blocks in which stations are linked, each with the plans whose stations may lie within its halo."""
+        """Return the blocks to link, the largest first, each with the plans whose stations may lie within its halo."""
         config, side = self.job.config.link, self.tile_config.block_m
         rows = {plan.place: row for row, plan in enumerate(self.plans)}
         out = {}
@@ -324,7 +324,7 @@ class _Run:
         return _sort_by_size(out, lambda row: self.plans[row].size)
 
     def _blocks_of_domains(self, homes: Sequence[_Plan]) -> dict[Place, tuple[Place, ...]]:
-        """Return the blocks whose home observations may lie within the halo of each domain, by column and row."""
+        """Return the domains, the largest first, each with the blocks whose home observations may lie within its halo."""
         known, side = {p.place: p.size for p in homes}, self.tile_config.block_m
         solver = self.job.config.pose_solver
         out = {}
