@@ -346,3 +346,22 @@ def test_honest_observations_are_not_locked_on_the_next_lane():
     assert honest.sum() == 56 and lateral.max() < 1.5
     assert (solution.agent_weight[rows][honest] < 0.1).sum() == 0
     assert (solution.agent_weight[rows][experiment.fleet.roles == OUTLIER] < 0.1).all()
+
+
+def test_a_search_among_the_same_inliers_runs_once(monkeypatch):
+    searched = []
+
+    def search(arrays, keep, home, config):
+        searched.append(int(keep.sum()))
+        return np.asarray(arrays.pose)[home]
+
+    monkeypatch.setattr(pose_optimization, "search_coarse", search)
+    honest = [make_observation((2.0 * k, 0.0, 0.0), f"a{k}", k, (0.0, 0.1 * (k % 3), 0.0)) for k in range(8)]
+    assert (solve_poses(honest).agent_weight > REJECTED_WEIGHT).all()
+    assert len(searched) == 1
+    moved = [make_observation((4.0 * k, 0.0, 0.0), "moved", 10 + k, (0.0, 1.8, 0.0)) for k in range(4)]
+    found = solve_poses([*honest, *moved])
+    assert [found.agents[k] for k in np.flatnonzero(found.agent_weight <= REJECTED_WEIGHT)] == ["moved"] * 4
+    # Among all, then among those that are left, of which both passes leave the same.
+    first, second = searched[1:]
+    assert second < first

@@ -7,7 +7,7 @@ eliminated one by one (Schur complement), and what is left is block tridiagonal 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-@dataclass(frozen=True, eq=False)
-class DriveFactor:
+class DriveFactor(NamedTuple):
     """Factors of a symmetric matrix of O poses, then S biases, three unknowns each.
 
     state: (O,) the bias of each pose. pose_inverse: (O, 3, 3) of the blocks on the diagonal. coupling: (O, 3, 3) blocks of poses
@@ -28,11 +27,11 @@ class DriveFactor:
     step: (S, 3, 3) blocks of each bias and the one before it; 0 at the start of a drive.
     """
 
-    state: Ints
-    pose_inverse: Floats
-    coupling: Floats
-    state_inverse: Floats
-    step: Floats
+    state: I64x1
+    pose_inverse: F64x3
+    coupling: F64x3
+    state_inverse: F64x3
+    step: F64x3
 
     @classmethod
     def of_matrix(cls, matrix: bsr_array, state: Ints, is_linked: NDArray[np.bool_]) -> DriveFactor:
@@ -46,13 +45,6 @@ class DriveFactor:
         state_inverse = diagonal[count:]
         _invert_along_drives(state_inverse, step)
         return cls(state, pose_inverse, coupling, state_inverse, step)
-
-    def solve(self, vector: Floats) -> Floats:
-        """Solve for a right side (3 (O + S),)."""
-        out = vector.reshape(-1, 3).copy()
-        poses, biases = out[: len(self.state)], out[len(self.state) :]
-        _solve_chain(self.state, self.pose_inverse, self.coupling, self.state_inverse, self.step, poses, biases)
-        return out.reshape(-1)
 
 
 def _take_blocks(matrix: bsr_array, row: Ints, column: Ints) -> Floats:
@@ -96,16 +88,9 @@ def _invert_symmetric(m: F64x2, out: F64x2) -> None:  # pragma: no cover - compi
 
 
 @njit(cache=True, nogil=True)
-def _solve_chain(
-    state: I64x1,
-    pose_inverse: F64x3,
-    coupling: F64x3,
-    state_inverse: F64x3,
-    step: F64x3,
-    poses: F64x2,
-    biases: F64x2,
-) -> None:  # pragma: no cover - compiled
+def solve_chain(factor: DriveFactor, poses: F64x2, biases: F64x2) -> None:  # pragma: no cover - compiled
     """Replace right sides of poses (O, 3) and biases (S, 3) by the solution."""
+    state, pose_inverse, coupling, state_inverse, step = factor
     moved, pulled = np.empty(3), np.empty(3)
     for o in range(len(poses)):
         _multiply(pose_inverse[o], poses[o], moved)

@@ -4,7 +4,7 @@
 The prior pose of observation o of drive d is off by b_do + e_o. The bias b of a drive starts from N(0, rho P) and drifts as a
 random walk over the distance driven; e is independent and has (1 - rho) P. Pairs of points
 (:mod:`manyeyes.maps.fusion.pair_system`) couple the poses of different observations. All of it is one sparse linear system a
-step, solved directly. Each e and the first bias of each drive have a Geman-McClure weight, so that one bad observation, or one
+step. Each e and the first bias of each drive have a Geman-McClure weight, so that one bad observation, or one
 bad drive, releases its own prior and no other.
 """
 
@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array
-from scipy.sparse.linalg import LinearOperator, cg
 
+from manyeyes.maps.fusion.conjugate_gradients import solve_by_conjugate_gradients
 from manyeyes.maps.fusion.drive_factor import DriveFactor
 from manyeyes.maps.fusion.pair_blocks import PairBlocks
 from manyeyes.maps.fusion.sparse_inverse import SymmetricFactor, solve_by_factors
@@ -135,8 +135,9 @@ def solve_joint_step(pairs: PairBlocks, priors: JointPriors, scale: float, toler
 def _solve_iteratively(system: JointSystem, chain: DriveChain, tolerance: float) -> Floats:
     """Solve by conjugate gradients, preconditioned by all but the couplings between observations."""
     factor = DriveFactor.of_matrix(system.apart, chain.state, chain.previous >= 0)
-    multiply, precondition = (LinearOperator(system.apart.shape, one) for one in (system.multiply, factor.solve))
-    return cg(multiply, system.right_side, rtol=tolerance, maxiter=MAX_ITERATIONS, M=precondition)[0]
+    return solve_by_conjugate_gradients(
+        system.apart, system.pairs, factor, system.right_side, tolerance, MAX_ITERATIONS
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,12 +150,6 @@ class JointSystem:
     apart: bsr_array
     pairs: PairBlocks
     right_side: Floats
-
-    def multiply(self, vector: Floats) -> Floats:
-        """Multiply the matrix by a vector (3 (O + S),)."""
-        out, coupled = self.apart @ vector, 3 * len(self.pairs.own)
-        out[:coupled] += self.pairs.multiply(vector[:coupled].reshape(-1, 3)).reshape(-1)
-        return out
 
     def to_matrix(self) -> bsr_array:
         """Return the whole matrix."""

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,19 +23,18 @@ _OTHER = np.array([0, 1, 3, 1, 2, 4, 3, 4, 5])
 _BETWEEN = np.array([0, 1, 3, 1, 2, 4, 6, 7, 8])
 
 
-@dataclass(frozen=True, eq=False)
-class PairBlocks:
+class PairBlocks(NamedTuple):
     """Sums of all pairs over O observations: own (O, 3, 3), right side (O, 3), and the couplings of each to those in later rows.
 
     offsets: (O + 1,) of the couplings. other: (M,) rows, ascending for each observation. coupling: (M, 3, 3), which stands at
     (row, other), and transposed at (other, row).
     """
 
-    own: Floats
-    right_side: Floats
-    offsets: Ints
-    other: Ints
-    coupling: Floats
+    own: F64x3
+    right_side: F64x2
+    offsets: I64x1
+    other: I64x1
+    coupling: F64x3
 
     @classmethod
     def of_sums(cls, pairs: PairSums, ids: Sequence[str]) -> PairBlocks:
@@ -53,12 +52,6 @@ class PairBlocks:
     def row(self) -> Ints:
         """The row (M,) of each coupling."""
         return np.repeat(np.arange(len(self.own)), np.diff(self.offsets))
-
-    def multiply(self, vector: Floats) -> Floats:
-        """Multiply the couplings, in both places of each, by a vector (O, 3)."""
-        out = np.zeros_like(vector)
-        _multiply_couplings(self.offsets, self.other, self.coupling, vector, out)
-        return out
 
 
 @njit(cache=True, nogil=True)
@@ -126,10 +119,9 @@ def _merge_directions(
 
 
 @njit(cache=True, nogil=True)
-def _multiply_couplings(
-    offsets: I64x1, other: I64x1, coupling: F64x3, vector: F64x2, out: F64x2
-) -> None:  # pragma: no cover - compiled
-    """Add the product of the couplings and a vector (O, 3) to out (O, 3)."""
+def multiply_couplings(pairs: PairBlocks, vector: F64x2, out: F64x2) -> None:  # pragma: no cover - compiled
+    """Add the product of the couplings, in both places of each, and a vector (O, 3) to out (O, 3)."""
+    offsets, other, coupling = pairs.offsets, pairs.other, pairs.coupling
     for row in range(len(offsets) - 1):
         x, y, t = vector[row, 0], vector[row, 1], vector[row, 2]
         own_x, own_y, own_t = 0.0, 0.0, 0.0

@@ -72,16 +72,30 @@ def solve_poses(observations: Sequence[Observation], config: PoseSolverConfig = 
     """Solve for the pose of each observation; a pure function of the set."""
     arrays = to_observation_arrays(observations, config.spacing_m)
     home = np.arange(len(arrays))
-    state = merge_solutions([search_coarse_poses(arrays, home, config)], config)
-    keep = None
-    for number in range(config.num_steps):
-        if number == 0 or config.schedule[number - 1].joint is None:
-            # After a search, which alone changes the initial poses.
-            keep = limit_per_cell(
-                arrays, state.initial_pose[state.row_indices(arrays.ids)], config.max_observations_per_cell
-            )
-        state = merge_solutions([run_step(arrays, state, number, home, config, keep)], config, number)
+    found = search_coarse_poses(arrays, home, config)
+    # A search depends on the inliers alone.
+    searches = {_inliers_of(found): found}
+    state, keep = merge_solutions([found], config), None
+    for number, step in enumerate(config.schedule):
+        if step.joint is None:
+            inliers = _inliers_of(state)
+            if inliers not in searches:
+                searches[inliers] = run_step(arrays, state, number, home, config)
+            found = searches[inliers]
+        else:
+            if keep is None:
+                keep = limit_per_cell(
+                    arrays, state.initial_pose[state.row_indices(arrays.ids)], config.max_observations_per_cell
+                )
+            found = run_step(arrays, state, number, home, config, keep)
+        state = merge_solutions([found], config, number)
+        # A search alone changes the initial poses.
+        keep = None if step.joint is None else keep
     return state
+
+
+def _inliers_of(state: PoseSolution) -> bytes:
+    return (state.agent_weight > REJECTED_WEIGHT).tobytes()
 
 
 def find_overlapping(
