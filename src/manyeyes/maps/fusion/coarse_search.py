@@ -116,7 +116,7 @@ def search_coarse(arrays: ObservationArrays, keep: NDArray[np.bool_], home: Ints
     grid = build_grid(xy[chosen, 0], xy[chosen, 1], arrays.kind_of_point[chosen], 8.0)
     rows = chosen[grid.order]
     agent = arrays.agent[arrays.observation_of_point[rows]]
-    drawn = DrawnPoints(grid.keys, grid.offsets, xy[rows], count_half_turns(tangent[rows]), agent)
+    drawn = DrawnPoints(grid.keys, grid.offsets, xy.take(rows, 0), count_half_turns(tangent.take(rows, 0)), agent)
     shifts = find_best_shifts(home, to_searched_observations(arrays), drawn, config.kernel_params)
     return apply_shifts(arrays, home, shifts)
 

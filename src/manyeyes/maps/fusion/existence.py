@@ -268,7 +268,7 @@ class EvidenceTable(NamedTuple):
     def take(self, rows: Ints) -> EvidenceTable:
         """Return the chosen rows, in the order given."""
         first, places = take_rows(self.source_offsets, rows)
-        columns = {name: getattr(self, name)[rows] for name in self._fields[:-3]}
+        columns = {name: getattr(self, name).take(rows, 0) for name in self._fields[:-3]}
         return self._replace(source_offsets=first, sources=self.sources[places], **columns)
 
     @classmethod
@@ -369,8 +369,8 @@ def accumulate_evidence(
     others = _EvidencePoints(
         grid.keys,
         grid.offsets,
-        world[order],
-        direction[order],
+        world.take(order, 0),
+        direction.take(order, 0),
         arrays.observation_of_point[order],
         arrays.element_of_point[order],
         weight[order],
@@ -397,7 +397,9 @@ def _compute_common_variance(
     """Compute the lateral variance (K,) at stations by the common covariance of the poses of their sources, mean over them."""
     count = np.diff(offsets)
     station = np.repeat(np.arange(len(count)), count)
-    variance = compute_lateral_variance(xy[station], tangent[station], pose[sources], common_covariance[sources])
+    variance = compute_lateral_variance(
+        xy.take(station, 0), tangent.take(station, 0), pose.take(sources, 0), common_covariance.take(sources, 0)
+    )
     return np.bincount(station, variance.clip(0.0), len(count)) / np.maximum(1, count)
 
 

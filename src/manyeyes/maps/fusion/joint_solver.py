@@ -200,4 +200,4 @@ def bsr_from_blocks(families: list[tuple[Ints, Ints, Floats]], size: int) -> bsr
     begins = np.flatnonzero(np.concatenate((np.ones(min(1, len(place)), bool), place[1:] != place[:-1])))
     row, column = np.divmod(place[begins], size)
     offsets = np.concatenate(([0], np.cumsum(np.bincount(row, minlength=size))))
-    return bsr_array((np.add.reduceat(block[order], begins), column, offsets), shape=(3 * size, 3 * size))
+    return bsr_array((np.add.reduceat(block.take(order, 0), begins), column, offsets), shape=(3 * size, 3 * size))

@@ -58,10 +58,10 @@ def mean_shift_to_ridges(
     order = grid.order
     cosine = float(np.cos(config.max_heading_rad))
     return _shift(
-        xy[seeds],
-        tangent[seeds],
+        xy.take(seeds, 0),
+        tangent.take(seeds, 0),
         kind[seeds],
-        _WeightedPoints(grid.keys, grid.offsets, xy[order], tangent[order], weight[order]),
+        _WeightedPoints(grid.keys, grid.offsets, xy.take(order, 0), tangent.take(order, 0), weight[order]),
         _Kernel(
             config.longitudinal_extent_m,
             config.lateral_extent_m,
@@ -205,7 +205,7 @@ def thin_ridges(
     place[grid.order] = np.arange(len(xy))
     walk = place[np.lexsort((xy[:, 1], xy[:, 0], priority))]
     gates = _ThinningGates(config.spacing_m, config.min_separation_m, float(np.cos(config.max_heading_rad * 1.5)))
-    kept = _thin(walk, grid, xy[grid.order], tangent[grid.order], kind[grid.order], gates)
+    kept = _thin(walk, grid, xy.take(grid.order, 0), tangent.take(grid.order, 0), kind[grid.order], gates)
     return np.sort(grid.order[kept])
 
 

@@ -201,8 +201,8 @@ def _sum_home_pairs(
             grid.cell_m,
             grid.keys,
             grid.offsets,
-            xy[order],
-            tangent[order],
+            xy.take(order, 0),
+            tangent.take(order, 0),
             np.asarray(arrays.observation_of_point)[order],
         ),
         PairLimits(

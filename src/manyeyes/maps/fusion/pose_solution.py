@@ -84,7 +84,7 @@ class PoseSolution:
 
     def take(self, rows: Ints) -> PoseSolution:
         """Return the chosen rows without pairs, in the order given."""
-        columns: dict[str, Any] = {name: getattr(self, name)[rows] for name in _COLUMNS}
+        columns: dict[str, Any] = {name: getattr(self, name).take(rows, 0) for name in _COLUMNS}
         for name in ("ids", "agents", "drives"):
             columns[name] = tuple(getattr(self, name)[k] for k in rows.tolist())
         return PoseSolution(**columns)
@@ -147,13 +147,14 @@ def _merge_pairs(parts: Sequence[PairSums], order: Ints) -> PairSums:
         first += len(part.own)
         places = np.arange(len(part.shared)) + np.repeat(begin - part.offsets[:-1], np.diff(part.offsets))
         other_ids[places], shared[places] = part.other_ids, part.shared
-    return PairSums(np.concatenate([part.own for part in parts])[order], offsets, other_ids, shared)
+    return PairSums(np.concatenate([part.own for part in parts]).take(order, 0), offsets, other_ids, shared)
 
 
 def take_pairs(pairs: PairSums, order: Ints) -> PairSums:
     """Return the pairs of the chosen observations, in the order given."""
     offsets, places = take_rows(pairs.offsets, order)
-    return PairSums(pairs.own[order], offsets, pairs.other_ids[places], pairs.shared[places])
+    # numpy.take copies rows several times as fast as an index does.
+    return PairSums(pairs.own.take(order, 0), offsets, pairs.other_ids.take(places, 0), pairs.shared.take(places, 0))
 
 
 def make_initial_solution(arrays: ObservationArrays) -> PoseSolution:

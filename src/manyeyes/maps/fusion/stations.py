@@ -107,7 +107,13 @@ class StationTable:
         ring_offsets, places = take_rows(start, rings)
         observed_cells = merge_runs(np.concatenate([t.observed_cells for t in tables]))
         return cls(
-            xy[order], tangent[order], line.take(order), ring_offsets, points[places], ring.take(rings), observed_cells
+            xy.take(order, 0),
+            tangent.take(order, 0),
+            line.take(order),
+            ring_offsets,
+            points[places],
+            ring.take(rings),
+            observed_cells,
         )
 
     def take_area(self, area: Area, halo_m: float) -> StationTable:
@@ -117,8 +123,8 @@ class StationTable:
         ring_offsets, places = take_rows(self.ring_offsets, rings)
         wide = (area[0] - halo_m, area[1] - halo_m, area[2] + halo_m, area[3] + halo_m)
         return StationTable(
-            self.xy[rows],
-            self.tangent[rows],
+            self.xy.take(rows, 0),
+            self.tangent.take(rows, 0),
             self.line_evidence.take(rows),
             ring_offsets,
             self.ring_xy[places],
@@ -178,15 +184,15 @@ def _build_line_stations(
     inside = _within(xy[counts], area, config.halo_m)
     places, turned, _ = mean_shift_to_ridges(
         np.flatnonzero(inside),
-        xy[counts],
-        tangent[counts],
+        xy.take(counts, 0),
+        tangent.take(counts, 0),
         arrays.kind_of_point[counts],
         point_weight[counts],
         config.ridge,
     )
     seeds = counts[inside]
     kept = thin_ridges(places, turned, arrays.kind_of_point[seeds], arrays.priority[seeds], config.ridge)
-    seeds, places, turned = seeds[kept], places[kept], turned[kept]
+    seeds, places, turned = seeds[kept], places.take(kept, 0), turned.take(kept, 0)
     kind = arrays.kind_of_point[seeds]
     shift, found = accumulate_evidence(
         places, turned, kind, arrays, pose, point_weight, is_inlier, common_covariance, config.evidence
@@ -198,10 +204,10 @@ def _build_line_stations(
     thinned = thin_ridges(places[stays], turned[stays], kind[stays], arrays.priority[seeds[stays]], config.ridge)
     stays = stays[thinned]
     table = found.take(stays)
-    places, turned = places[stays], turned[stays]
+    places, turned = places.take(stays, 0), turned.take(stays, 0)
     loses = _find_conflicts(places, turned, table, config)
     chosen = np.flatnonzero(_within(places, area, 0.0) & ~loses & ((table.log_odds > 0.0) | (table.state != 0)))
-    return places[chosen], turned[chosen], table.take(chosen)
+    return places.take(chosen, 0), turned.take(chosen, 0), table.take(chosen)
 
 
 def _compute_point_weights(
