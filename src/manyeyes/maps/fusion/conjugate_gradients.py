@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Conjugate gradients for the joint system: preconditioned by the factors of all but the couplings between observations.
 
-SciPy's loop spends more on its calls than on the products of a small system (Hestenes and Stiefel, 1952; preconditioned as in Saad,
-Iterative Methods for Sparse Linear Systems, 2003, algorithm 9.1).
+Hestenes and Stiefel, 1952; preconditioned as in Saad, Iterative Methods for Sparse Linear Systems, 2003, algorithm 9.1. SciPy has
+the same method, but of a small system its calls take longer than the products.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def solve_by_conjugate_gradients(
 
     Args:
         apart: the matrix without the couplings between observations; factor: its factors. pairs: holds the couplings.
-        tolerance: norm of the residual over that of the right side at which it stops.
+        tolerance: it stops where the norm of the residual is at most this times that of the right side, or after max_iterations.
     """
     solution = np.zeros((len(right_side) // 3, 3))
     residual = right_side.reshape(-1, 3).copy()
@@ -55,22 +55,22 @@ def _iterate(
     num_poses = len(pairs.own)
     goal = tolerance * tolerance * _dot(residual, residual)
     direction, product = np.zeros_like(residual), np.empty_like(residual)
-    conditioned = np.empty_like(residual)
-    last = 1.0
+    preconditioned = np.empty_like(residual)
+    last_square = 1.0
     for iteration in range(max_iterations):
         if _dot(residual, residual) <= goal:
             break
-        set_rows(conditioned, residual)
-        solve_chain(factor, conditioned[:num_poses], conditioned[num_poses:])
-        now = _dot(residual, conditioned)
-        _add_scaled(conditioned, direction, now / last if iteration else 0.0)
-        direction, conditioned = conditioned, direction
+        set_rows(preconditioned, residual)
+        solve_chain(factor, preconditioned[:num_poses], preconditioned[num_poses:])
+        square = _dot(residual, preconditioned)
+        _add_scaled(preconditioned, direction, square / last_square if iteration else 0.0)
+        direction, preconditioned = preconditioned, direction
         _multiply_blocks(apart, direction, product)
         multiply_couplings(pairs, direction[:num_poses], product[:num_poses])
-        rate = now / _dot(direction, product)
+        rate = square / _dot(direction, product)
         _add_scaled(solution, direction, rate)
         _add_scaled(residual, product, -rate)
-        last = now
+        last_square = square
 
 
 @njit(cache=True, nogil=True)
