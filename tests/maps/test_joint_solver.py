@@ -25,7 +25,7 @@ from manyeyes.maps.fusion.joint_solver import (
 from manyeyes.maps.fusion.observation_arrays import to_observation_arrays
 from manyeyes.maps.fusion.pair_blocks import PairBlocks
 from manyeyes.maps.fusion.pose_config import JointIteration, PoseSolverConfig
-from manyeyes.maps.fusion.pose_optimization import solve_poses
+from manyeyes.maps.fusion.pose_optimization import merge_solutions, search_coarse_poses, solve_poses
 from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT, make_initial_solution
 from manyeyes.simulator.fleet.config import CROWDS
 from manyeyes.simulator.fleet.simulate import HONEST, OUTLIER
@@ -365,3 +365,29 @@ def test_a_search_among_the_same_inliers_runs_once(monkeypatch):
     # Among all, then among those that are left, of which both passes leave the same.
     first, second = searched[1:]
     assert second < first
+
+
+def test_a_rejection_pass_among_the_same_inliers_runs_once(monkeypatch):
+    numbers, original = [], pose_optimization.run_step
+
+    def run(arrays, state, number, *rest):
+        numbers.append(number)
+        return original(arrays, state, number, *rest)
+
+    monkeypatch.setattr(pose_optimization, "run_step", run)
+    honest = [make_observation((2.0 * k, 0.0, 0.0), f"a{k}", k, (0.0, 0.1 * (k % 3), 0.0)) for k in range(8)]
+    schedule = CONFIG.schedule
+    first, second = (k for k, step in enumerate(schedule) if step.joint is None)
+    found = solve_poses(honest)
+    assert numbers == [*range(first), *range(second + 1, len(schedule))]
+    # All steps, one after the other, give the same poses.
+    arrays = to_observation_arrays(honest, CONFIG.spacing_m)
+    home = np.arange(len(honest))
+    state = merge_solutions([search_coarse_poses(arrays, home)])
+    for number in range(len(schedule)):
+        state = merge_solutions([original(arrays, state, number, home)], CONFIG, number)
+    np.testing.assert_array_equal(state.pose, found.pose)
+    numbers.clear()
+    solve_poses([*honest, *(make_observation((4.0 * k, 0.0, 0.0), "moved", 10 + k, (0.0, 1.8, 0.0)) for k in range(4))])
+    # The inliers of the second pass are others, so that it runs; the last search finds those of the one before.
+    assert numbers == [k for k in range(len(schedule)) if k != second]

@@ -73,24 +73,28 @@ def solve_poses(observations: Sequence[Observation], config: PoseSolverConfig = 
     arrays = to_observation_arrays(observations, config.spacing_m)
     home = np.arange(len(arrays))
     found = search_coarse_poses(arrays, home, config)
-    # A search depends on the inliers alone.
-    searches = {_inliers_of(found): found}
     state, keep = merge_solutions([found], config), None
+    # A search depends on the inliers alone, and so does the rejection pass after it.
+    inliers = _inliers_of(state)
+    searches = {inliers: found}
+    is_repeated, last_search = (
+        False,
+        max((k for k, step in enumerate(config.schedule) if step.joint is None), default=-1),
+    )
     for number, step in enumerate(config.schedule):
         if step.joint is None:
-            inliers = _inliers_of(state)
+            before, inliers = inliers, _inliers_of(state)
+            is_repeated = inliers == before
             if inliers not in searches:
                 searches[inliers] = run_step(arrays, state, number, home, config)
-            found = searches[inliers]
-        else:
+            state, keep = merge_solutions([searches[inliers]], config, number), None
+        elif number > last_search or not is_repeated:
             if keep is None:
+                # Only a search changes the initial poses.
                 keep = limit_per_cell(
                     arrays, state.initial_pose[state.row_indices(arrays.ids)], config.max_observations_per_cell
                 )
-            found = run_step(arrays, state, number, home, config, keep)
-        state = merge_solutions([found], config, number)
-        # A search alone changes the initial poses.
-        keep = None if step.joint is None else keep
+            state = merge_solutions([run_step(arrays, state, number, home, config, keep)], config, number)
     return state
 
 
