@@ -72,7 +72,7 @@ class PoseSolverConfig:
     """
 
     spacing_m: float = 1.0
-    num_iterations: int = 6
+    num_iterations: int = 8
     num_rejection_iterations: int = 4
     num_rejection_passes: int = 2
     rejection_point_stride: int = 3
