@@ -76,11 +76,8 @@ def solve_poses(observations: Sequence[Observation], config: PoseSolverConfig = 
     state, keep = merge_solutions([found], config), None
     # A search depends on the inliers alone, and so does the rejection pass after it.
     inliers = _inliers_of(state)
-    searches = {inliers: found}
-    is_repeated, last_search = (
-        False,
-        max((k for k, step in enumerate(config.schedule) if step.joint is None), default=-1),
-    )
+    searches, is_repeated = {inliers: found}, False
+    last_search = max((number for number, step in enumerate(config.schedule) if step.joint is None), default=-1)
     for number, step in enumerate(config.schedule):
         if step.joint is None:
             before, inliers = inliers, _inliers_of(state)
