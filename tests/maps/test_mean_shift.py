@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from manyeyes.maps.fusion.mean_shift import RidgeConfig, mean_shift_to_ridges, thin_ridges
+from manyeyes.maps.fusion.mean_shift import RidgeConfig, choose_seeds, mean_shift_to_ridges, thin_ridges
 from manyeyes.maps.fusion.point_grid import line_residual
 
 CONFIG = RidgeConfig()
@@ -75,6 +75,34 @@ def test_lines_a_lane_apart_stay_separate_and_other_kinds_do_not_count():
         np.concatenate((kind, kind + 1)), np.concatenate((weight, weight)), CONFIG,
     )[0]  # fmt: skip
     np.testing.assert_array_equal(both, places)
+
+
+def test_few_seeds_reach_the_ridges_of_all_points():
+    xy, tangent, kind, weight = make_lines(1500)
+    priority = np.random.default_rng(8).permutation(len(xy)).astype(np.uint64)
+    seeds = choose_seeds(xy, tangent, kind, priority, CONFIG)
+    assert 3 * len(seeds) < len(xy)
+    ridges = []
+    for rows in (np.arange(len(xy)), seeds):
+        places, turned, _ = mean_shift_to_ridges(rows, xy, tangent, kind, weight, CONFIG)
+        ridges.append(places[thin_ridges(places, turned, kind[rows], priority[rows], CONFIG)])
+    every, few = ridges
+    assert len(few) > 0.9 * len(every)
+    u, v = np.cos(np.radians(20.0)), np.sin(np.radians(20.0))
+    aside = few @ (-v, u)
+    assert np.percentile(np.minimum(abs(aside), abs(aside - 3.5)), 90) < 0.08
+    # A point is missing only beside one that stands for it.
+    for middle in (0.0, 3.5):
+        along = np.sort((few @ (u, v))[abs(few @ (-v, u) - middle) < 1.0])
+        assert np.diff(along).max() < 2.0 * (CONFIG.spacing_m + CONFIG.seed_spacing_m)
+
+
+def test_a_seed_stands_for_the_points_of_its_own_line_alone():
+    # Four points at one place: two along x of either sense, one that crosses them, one of another kind.
+    xy = np.array([[10.0, 4.0], [10.1, 4.1], [10.1, 4.0], [10.0, 4.1]])
+    tangent = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [1.0, 0.0]])
+    priority = np.array([7, 3, 9, 5], np.uint64)
+    assert choose_seeds(xy, tangent, np.array([0, 0, 0, 1]), priority, CONFIG).tolist() == [1, 2, 3]
 
 
 @pytest.mark.parametrize("moved", [(0.3, 0.0), (0.0, 1.1), (1.7, -0.9)])

@@ -33,6 +33,7 @@ class RidgeConfig:
 
     longitudinal_extent_m, lateral_extent_m: half extents of the kernel.
     longitudinal_sigma_m, lateral_sigma_m: its Gaussian scales. max_heading_rad: heading gate.
+    seed_spacing_m, seed_separation_m: longitudinal and lateral distance below which one point is moved for both.
     num_iterations: of mean shift. spacing_m: distance of the points that remain.
     min_separation_m: lateral distance below which points belong to one ridge.
     """
@@ -42,6 +43,8 @@ class RidgeConfig:
     longitudinal_sigma_m: float = 1.2
     lateral_sigma_m: float = 0.45
     max_heading_rad: float = 0.35
+    seed_spacing_m: float = 0.35
+    seed_separation_m: float = 0.25
     num_iterations: int = 4
     spacing_m: float = 0.7
     min_separation_m: float = 0.5
@@ -193,6 +196,17 @@ def _sum_near(n: int, near: F64x2) -> tuple[float, float, float, float]:  # prag
     return total, pull, cc, ss
 
 
+def choose_seeds(
+    xy: Floats, tangent: Floats, kind: Ints, priority: NDArray[np.uint64], config: RidgeConfig = RidgeConfig()
+) -> Ints:
+    """Select the points (S,) for mean shift to move: of those that nearly coincide, and would reach one ridge, the first one.
+
+    Order and independence of tiles are those of :func:`thin_ridges`.
+    """
+    gates = _ThinningGates(config.seed_spacing_m, config.seed_separation_m, float(np.cos(config.max_heading_rad)))
+    return _thin_in_order(xy, tangent, kind, priority, gates)
+
+
 def thin_ridges(
     xy: Floats, tangent: Floats, kind: Ints, priority: NDArray[np.uint64], config: RidgeConfig = RidgeConfig()
 ) -> Ints:
@@ -200,11 +214,17 @@ def thin_ridges(
 
     Priorities are pseudo-random, so the result for a point depends on few neighbours and on no tile border.
     """
+    gates = _ThinningGates(config.spacing_m, config.min_separation_m, float(np.cos(config.max_heading_rad * 1.5)))
+    return _thin_in_order(xy, tangent, kind, priority, gates)
+
+
+def _thin_in_order(
+    xy: Floats, tangent: Floats, kind: Ints, priority: NDArray[np.uint64], gates: _ThinningGates
+) -> Ints:
     grid = build_grid(xy[:, 0], xy[:, 1], kind, _THIN_CELL_M)
     place = np.empty(len(xy), np.int64)
     place[grid.order] = np.arange(len(xy))
     walk = place[np.lexsort((xy[:, 1], xy[:, 0], priority))]
-    gates = _ThinningGates(config.spacing_m, config.min_separation_m, float(np.cos(config.max_heading_rad * 1.5)))
     kept = _thin(walk, grid, xy.take(grid.order, 0), tangent.take(grid.order, 0), kind[grid.order], gates)
     return np.sort(grid.order[kept])
 

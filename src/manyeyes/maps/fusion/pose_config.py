@@ -44,9 +44,11 @@ class PoseSolverConfig:
 
     spacing_m: distance of the sampled points.
     num_iterations: joint steps of the final pass; num_rejection_iterations: of a rejection pass; num_rejection_passes: number
-        of such passes, each followed by a repeated search; rejection_point_stride, final_point_stride: every n-th point is used.
+        of such passes, each followed by a repeated search.
     gate_m, kernel_m, prior_scale: first and last lateral gate, Geman-McClure scale of the pairs, and Geman-McClure scale of the
         priors in standard deviations. They fall geometrically over the first settled_fraction of a pass and then stay.
+    rejection_point_stride, annealed_point_stride, settled_point_stride: every n-th point is used in a rejection pass, in the steps
+        of the final pass whose widths still fall, and in those after them.
     max_longitudinal_m, max_heading_rad: longitudinal and heading gate of pairs.
     sigma_m: standard deviation of the lines beside their own. points_per_independent: points of one line that count as one.
     surveyed_weight: weight of a surveyed pole's lines.
@@ -75,12 +77,13 @@ class PoseSolverConfig:
     num_iterations: int = 8
     num_rejection_iterations: int = 4
     num_rejection_passes: int = 2
-    rejection_point_stride: int = 3
-    final_point_stride: int = 2
     gate_m: tuple[float, float] = (2.0, 1.0)
     kernel_m: tuple[float, float] = (0.8, 0.5)
     prior_scale: tuple[float, float] = (9.0, 3.0)
     settled_fraction: float = 0.75
+    rejection_point_stride: int = 3
+    annealed_point_stride: int = 4
+    settled_point_stride: int = 2
     max_longitudinal_m: float = 1.0
     max_heading_rad: float = 0.31
     sigma_m: float = 0.12
@@ -122,12 +125,14 @@ class PoseSolverConfig:
     @property
     def schedule(self) -> tuple[SolverStep, ...]:
         """The steps after the first search: for each rejection pass its joint steps and a search, then the final joint steps."""
-        rejection = self._anneal(self.num_rejection_iterations, self.rejection_point_stride)
+        rejection = self._anneal(
+            self.num_rejection_iterations, self.rejection_point_stride, self.rejection_point_stride
+        )
         out: list[SolverStep] = []
         for _ in range(self.num_rejection_passes):
             out += [SolverStep(one, decides=one is rejection[-1]) for one in rejection]
             out.append(SolverStep(None))
-        final = self._anneal(self.num_iterations, self.final_point_stride)
+        final = self._anneal(self.num_iterations, self.annealed_point_stride, self.settled_point_stride)
         return (*out, *(SolverStep(one, is_last=one is final[-1]) for one in final))
 
     @property
@@ -135,12 +140,14 @@ class PoseSolverConfig:
         """The number of steps after the first search."""
         return len(self.schedule)
 
-    def _anneal(self, count: int, point_stride: int) -> list[JointIteration]:
-        """Make the widths of a pass of joint steps."""
-        share = np.minimum(1.0, np.arange(count) / max(1.0, np.floor(count * self.settled_fraction)))
+    def _anneal(self, count: int, annealed_stride: int, settled_stride: int) -> list[JointIteration]:
+        """Make the widths of a pass of joint steps, and the strides of its points."""
+        settled = max(1.0, np.floor(count * self.settled_fraction))
+        share = np.minimum(1.0, np.arange(count) / settled)
         columns = [a * (b / a) ** share for a, b in (self.gate_m, self.kernel_m, self.prior_scale)]
         gate, kernel, prior = (column.tolist() for column in columns)
-        return [JointIteration(gate[k], kernel[k], prior[k], point_stride) for k in range(count)]
+        strides = [annealed_stride if k < settled else settled_stride for k in range(count)]
+        return [JointIteration(*widths) for widths in zip(gate, kernel, prior, strides)]
 
 
 DEFAULT_ALIGN = PoseSolverConfig()

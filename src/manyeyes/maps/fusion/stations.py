@@ -26,7 +26,7 @@ from manyeyes.maps.fusion.existence import (
     compute_lateral_variance,
     find_covered_by_inliers,
 )
-from manyeyes.maps.fusion.mean_shift import RidgeConfig, mean_shift_to_ridges, thin_ridges
+from manyeyes.maps.fusion.mean_shift import RidgeConfig, choose_seeds, mean_shift_to_ridges, thin_ridges
 from manyeyes.maps.fusion.observation_arrays import ObservationArrays, is_line
 from manyeyes.maps.fusion.observation_weights import compute_observation_weights
 from manyeyes.maps.fusion.point_grid import PointGrid, build_grid, find_cell_range
@@ -181,16 +181,11 @@ def _build_line_stations(
         & is_line(arrays.kind_of_point)
         & (point_weight > 0.0)
     )
-    inside = _within(xy[counts], area, config.halo_m)
-    places, turned, _ = mean_shift_to_ridges(
-        np.flatnonzero(inside),
-        xy.take(counts, 0),
-        tangent.take(counts, 0),
-        arrays.kind_of_point[counts],
-        point_weight[counts],
-        config.ridge,
-    )
-    seeds = counts[inside]
+    points = xy.take(counts, 0), tangent.take(counts, 0), arrays.kind_of_point[counts]
+    chosen = choose_seeds(*points, arrays.priority[counts], config.ridge)
+    chosen = chosen[_within(points[0][chosen], area, config.halo_m)]
+    places, turned, _ = mean_shift_to_ridges(chosen, *points, point_weight[counts], config.ridge)
+    seeds = counts[chosen]
     kept = thin_ridges(places, turned, arrays.kind_of_point[seeds], arrays.priority[seeds], config.ridge)
     seeds, places, turned = seeds[kept], places.take(kept, 0), turned.take(kept, 0)
     kind = arrays.kind_of_point[seeds]
