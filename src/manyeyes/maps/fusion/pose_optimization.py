@@ -72,7 +72,9 @@ def solve_poses(observations: Sequence[Observation], config: PoseSolverConfig = 
     """Solve for the pose of each observation; a pure function of the set."""
     arrays = to_observation_arrays(observations, config.spacing_m)
     home = np.arange(len(arrays))
-    found = search_coarse_poses(arrays, home, config)
+    # All searches begin at the prior poses.
+    searched = limit_per_cell(arrays, np.asarray(arrays.pose), config.max_observations_per_cell)
+    found = search_coarse_poses(arrays, home, config, searched)
     state, keep = merge_solutions([found], config), None
     # A search depends on the inliers alone, and so does the rejection pass after it.
     inliers = _inliers_of(state)
@@ -83,7 +85,7 @@ def solve_poses(observations: Sequence[Observation], config: PoseSolverConfig = 
             before, inliers = inliers, _inliers_of(state)
             is_repeated = inliers == before
             if inliers not in searches:
-                searches[inliers] = run_step(arrays, state, number, home, config)
+                searches[inliers] = run_step(arrays, state, number, home, config, searched)
             state, keep = merge_solutions([searches[inliers]], config, number), None
         elif number > last_search or not is_repeated:
             if keep is None:
@@ -117,12 +119,19 @@ def find_overlapping(
 
 
 def search_coarse_poses(
-    arrays: ObservationArrays, home: Ints, config: PoseSolverConfig = DEFAULT_ALIGN
+    arrays: ObservationArrays,
+    home: Ints,
+    config: PoseSolverConfig = DEFAULT_ALIGN,
+    keep: NDArray[np.bool_] | None = None,
 ) -> PoseSolution:
-    """Run the coarse search for the home observations, rows (H,) of the arrays; ids ascending."""
+    """Run the coarse search for the home observations, rows (H,) of the arrays; ids ascending.
+
+    keep: (P,) points that count, :func:`limit_per_cell` at the prior poses; None: computed here.
+    """
     state = _select_home(make_initial_solution(arrays), arrays, home)
     rows = _rows_in(arrays, state)
-    keep = limit_per_cell(arrays, np.asarray(arrays.pose), config.max_observations_per_cell)
+    if keep is None:
+        keep = limit_per_cell(arrays, np.asarray(arrays.pose), config.max_observations_per_cell)
     found = search_coarse(arrays, keep, rows, config.coarse_search)
     return replace(state, initial_pose=found, pose=found)
 
@@ -137,27 +146,25 @@ def run_step(
 ) -> PoseSolution:
     """Run the local part of one more step for the home observations; ids ascending.
 
-    state: all observations of the arrays after the previous step. keep: (P,) points that count in a joint step,
-    :func:`limit_per_cell` at the initial poses of the state; None: computed here.
+    state: all observations of the arrays after the previous step. keep: (P,) points that count, :func:`limit_per_cell` at the
+    prior poses in a search, at the initial poses of the state in a joint step; None: computed here.
     """
     step = config.schedule[number]
-    if step.joint is None:
-        return _repeat_search(arrays, state, home, config)
     if keep is None:
-        keep = limit_per_cell(
-            arrays, state.initial_pose[state.row_indices(arrays.ids)], config.max_observations_per_cell
-        )
+        start = np.asarray(arrays.pose) if step.joint is None else state.initial_pose[state.row_indices(arrays.ids)]
+        keep = limit_per_cell(arrays, start, config.max_observations_per_cell)
+    if step.joint is None:
+        return _repeat_search(arrays, state, keep, home, config)
     return _sum_home_pairs(arrays, state, np.flatnonzero(keep), step.joint, home, config)
 
 
 def _repeat_search(
-    arrays: ObservationArrays, state: PoseSolution, home: Ints, config: PoseSolverConfig
+    arrays: ObservationArrays, state: PoseSolution, keep: NDArray[np.bool_], home: Ints, config: PoseSolverConfig
 ) -> PoseSolution:
-    """Reset the home observations to their prior poses and search again among inlier agents alone."""
+    """Reset the home observations to their prior poses and search again, among the points ``keep`` of inlier agents alone."""
     initial = _select_home(make_initial_solution(arrays), arrays, home)
     is_inlier = state.agent_weight > REJECTED_WEIGHT
-    keep = limit_per_cell(arrays, np.asarray(arrays.pose), config.max_observations_per_cell)
-    keep &= is_inlier[state.row_indices(arrays.ids)][arrays.observation_of_point]
+    keep = keep & is_inlier[state.row_indices(arrays.ids)][arrays.observation_of_point]
     found = search_coarse(arrays, keep, _rows_in(arrays, initial), config.coarse_search)
     agent_weight = np.where(is_inlier[state.row_indices(initial.ids)], 1.0, REJECTED_WEIGHT)
     return replace(initial, initial_pose=found, pose=found, agent_weight=agent_weight)
