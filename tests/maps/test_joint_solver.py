@@ -391,3 +391,11 @@ def test_a_rejection_pass_among_the_same_inliers_runs_once(monkeypatch):
     solve_poses([*honest, *(make_observation((4.0 * k, 0.0, 0.0), "moved", 10 + k, (0.0, 1.8, 0.0)) for k in range(4))])
     # The inliers of the second pass are others, so that it runs; the last search finds those of the one before.
     assert numbers == [k for k in range(len(schedule)) if k != second]
+
+
+def test_steps_of_the_final_pass_take_more_points_once_their_widths_no_longer_fall():
+    joint = [step.joint for step in CONFIG.schedule[-CONFIG.num_iterations :]]
+    has_settled = [step.gate_m == pytest.approx(CONFIG.gate_m[1]) for step in joint]
+    assert 0 < sum(has_settled) < len(joint) and has_settled == sorted(has_settled)
+    strides = [CONFIG.settled_point_stride if settled else CONFIG.annealed_point_stride for settled in has_settled]
+    assert [step.point_stride for step in joint] == strides
