@@ -33,7 +33,7 @@ class RidgeConfig:
 
     longitudinal_extent_m, lateral_extent_m: half extents of the kernel.
     longitudinal_sigma_m, lateral_sigma_m: its Gaussian scales. max_heading_rad: heading gate.
-    seed_spacing_m, seed_separation_m: longitudinal and lateral distance below which one point is moved for both.
+    seed_spacing_m, seed_separation_m: longitudinal and lateral distance below which only one of two points is moved.
     num_iterations: of mean shift. spacing_m: distance of the points that remain.
     min_separation_m: lateral distance below which points belong to one ridge.
     """
@@ -199,9 +199,9 @@ def _sum_near(n: int, near: F64x2) -> tuple[float, float, float, float]:  # prag
 def choose_seeds(
     xy: Floats, tangent: Floats, kind: Ints, priority: NDArray[np.uint64], config: RidgeConfig = RidgeConfig()
 ) -> Ints:
-    """Select the points (S,) for mean shift to move: of those that nearly coincide, and would reach one ridge, the first one.
+    """Select the points (S,) that mean shift moves, in order of priority: all but those that nearly coincide with a selected one.
 
-    Order and independence of tiles are those of :func:`thin_ridges`.
+    Points that nearly coincide reach one ridge. As in :func:`thin_ridges`, the result depends on no tile border.
     """
     gates = _ThinningGates(config.seed_spacing_m, config.seed_separation_m, float(np.cos(config.max_heading_rad)))
     return _thin_in_order(xy, tangent, kind, priority, gates)

@@ -182,10 +182,10 @@ def _build_line_stations(
         & (point_weight > 0.0)
     )
     points = xy.take(counts, 0), tangent.take(counts, 0), arrays.kind_of_point[counts]
-    chosen = choose_seeds(*points, arrays.priority[counts], config.ridge)
-    chosen = chosen[_within(points[0][chosen], area, config.halo_m)]
-    places, turned, _ = mean_shift_to_ridges(chosen, *points, point_weight[counts], config.ridge)
-    seeds = counts[chosen]
+    seeds = choose_seeds(*points, arrays.priority[counts], config.ridge)
+    seeds = seeds[_within(points[0][seeds], area, config.halo_m)]
+    places, turned, _ = mean_shift_to_ridges(seeds, *points, point_weight[counts], config.ridge)
+    seeds = counts[seeds]
     kept = thin_ridges(places, turned, arrays.kind_of_point[seeds], arrays.priority[seeds], config.ridge)
     seeds, places, turned = seeds[kept], places.take(kept, 0), turned.take(kept, 0)
     kind = arrays.kind_of_point[seeds]
