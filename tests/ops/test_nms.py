@@ -9,9 +9,10 @@ from manyeyes.ops.nms import find_kept, rotated_nms
 
 def slow_nms(boxes, score, threshold, pre=1000):
     order = sorted(range(len(boxes)), key=lambda i: (-score[i].item(), i))[:pre]
+    iou = pairwise_iou(boxes, boxes).tolist()
     kept = []
     for i in order:
-        if all(pairwise_iou(boxes[i : i + 1], boxes[j : j + 1]).item() <= threshold for j in kept):
+        if all(iou[i][j] <= threshold for j in kept):
             kept.append(i)
     return kept
 
