@@ -80,7 +80,7 @@ test-nightly: $(STAMP)
 	@HYPOTHESIS_PROFILE=nightly $(BIN)/python -m pytest
 
 probes: $(STAMP)
-	@MANYEYES_PROBES=long nice -n 10 $(BIN)/python -m pytest tests/probes tests/pose/test_registration.py
+	@MANYEYES_PROBES=long nice -n 10 $(BIN)/python -m pytest tests/probes
 
 coverage: $(STAMP)
 	@$(BIN)/python -m pytest --cov=manyeyes --cov-report=term:skip-covered

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One torch thread for every test; profiles of hypothesis; long tests; real maps read where they are; a device beside the CPU."""
+"""One torch thread for every test; profiles of hypothesis; real maps are read where they are; a device beside the CPU."""
 
 import os
 from collections.abc import Iterator
@@ -19,9 +19,6 @@ settings.register_profile("fast", CI, max_examples=20)
 settings.register_profile("nightly", CI, max_examples=2000, derandomize=False, print_blob=True)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
 
-# Probes take minutes or hours instead of seconds.
-IS_LONG = os.environ.get("MANYEYES_PROBES") == "long"
-
 # Golden numbers are those of float32 products; tests of bfloat16 name it.
 os.environ["MANYEYES_BFLOAT16"] = "0"
 
@@ -29,20 +26,6 @@ _MAPS = Path(__file__).resolve().parents[2] / "shared" / "data"
 if _MAPS.is_dir():
     os.environ.setdefault("MANYEYES_MAPS", str(_MAPS))
     os.environ.setdefault("MANYEYES_TOWNS", str(_MAPS / "carla_opendrive"))
-
-
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out tests marked ``long`` unless probes are long."""
-    left_out = [] if IS_LONG else [item for item in items if item.get_closest_marker("long")]
-    if left_out:
-        config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if item not in left_out]
-
-
-@pytest.fixture(scope="session")
-def is_long() -> bool:
-    """Whether probes take minutes or hours instead of seconds: the environment variable MANYEYES_PROBES is ``long``."""
-    return IS_LONG
 
 
 @pytest.fixture(params=["emulated", "cuda"])

@@ -214,7 +214,7 @@ def test_no_bytes_make_perceive_raise(drive, detector, name: str) -> None:
     """Bytes of honest packets at random places, with checksums made right: everything decodable is fused or rejected."""
     some, random = drive(2), np.random.default_rng(20)
     ego = Agent(detector, get_strategy(name))
-    for index in range(6):
+    for index in range(12):
         packets = []
         for precision in ("float32", "float16", "int8"):
             for packet in Agent(detector, get_strategy(name), token_encoding=precision).share(some.frame(1, index)):

@@ -106,7 +106,6 @@ def observe_boxes(seed: int) -> tuple[Boxes, Boxes, Transform]:
 
 
 @pytest.mark.parametrize("corrector", sorted({*list_correctors("landmarks")} - {"fpv-rcnn", "v2x-reg-oiou"}))
-@settings(max_examples=50)  # for each of many correctors, up to 50 ms an example
 @given(seed=SEEDS, x=st.floats(-40, 40), y=st.floats(-40, 40), yaw=st.floats(-3, 3))
 def test_a_corrected_pose_moves_with_the_ego_frame(assert_same, corrector, seed, x, y, yaw) -> None:
     """All but fpv-rcnn, which searches a grid along the axes of the ego, and the slow variant of v2x-reg, which leaves out boxes

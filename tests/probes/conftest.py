@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,23 @@ import pytest
 
 if TYPE_CHECKING:
     from tests.probes.runs import Run
+
+
+IS_LONG = os.environ.get("MANYEYES_PROBES") == "long"
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out tests marked ``long`` unless probes are long."""
+    left_out = [] if IS_LONG else [item for item in items if item.get_closest_marker("long")]
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in left_out]
+
+
+@pytest.fixture(scope="session")
+def is_long() -> bool:
+    """Whether probes take minutes or hours instead of seconds: the environment variable MANYEYES_PROBES is ``long``."""
+    return IS_LONG
 
 
 @pytest.fixture(scope="session")

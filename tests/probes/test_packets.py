@@ -173,7 +173,7 @@ def test_mutated_packets_change_no_honest_reception(
     tiny: Detector, mutable: list[Specimens], strategy: str, is_long: bool
 ) -> None:
     random = np.random.default_rng(list_strategies().index(strategy))
-    per_call = 400 if is_long else 40
+    per_call = 400 if is_long else 100
     probe = Probe(tiny, strategy, mutable, per_call, random)
     # The first drive fills the caches that stay.
     probe.receive_drive()
