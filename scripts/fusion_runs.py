@@ -4,10 +4,10 @@
 python scripts/fusion_runs.py --data FOLDER --out runs/fusions [--seeds 5 6 7] [--stage-c fast v2vnet] [--hours 8] [--jobs 2]
 
 Order: the base (stage-a); every fusion inside with the first seed; six bare ones; early fusion; the other seeds, fusion by
-fusion; the rows of CoSTr's Table III that are no run of before, each after its base; the other bare ones; stage C, 10,000 steps
-from nothing. A run has a folder OUT/NAME/seed-N, and is finished when its weights.safetensors is there. The same command goes on
-after it was stopped, in the middle of a run too. OUT/runs.json says which runs are finished, failed or left, and how long they
-took. A failed run does not stop the others; those that start from it are left.
+fusion; the rows of CoSTr's Table III; the other bare ones; stage C. The rows of Table III and stage C start from random weights,
+the others from the base. A run has a folder OUT/NAME/seed-N, and is finished when its weights.safetensors is there. The same
+command goes on after it was stopped, in the middle of a run too. OUT/runs.json says which runs are finished, failed or left, and
+how long they took. A failed run does not stop the others; those that start from it are left.
 """
 
 from __future__ import annotations
@@ -28,8 +28,6 @@ from manyeyes.training.detector.fusion_presets import BARE_FUSIONS, INSIDE_FUSIO
 WEIGHTS = "weights.safetensors"
 FIRST_BARE = BARE_FUSIONS[:6]
 """Bare fusions that are trained before other seeds."""
-SAME_RUNS = {f"table3/{name}" for name, row in TABLE3_ROWS.items() if row.is_whole}
-"""Rows of Table III that are runs of ``fusion/NAME``."""
 
 
 @dataclass(frozen=True)
@@ -64,13 +62,7 @@ def make_runs(seeds: Sequence[int], stage_c: Sequence[str] = ()) -> list[Run]:
     runs += [Run(f"fusion/{name}/bare", first) for name in FIRST_BARE]
     runs.append(Run("early", first))
     runs += [Run(f"fusion/{name}", seed) for name in INSIDE_FUSIONS for seed in others]
-    bases = {"stage-a"}
-    for name, row in TABLE3_ROWS.items():
-        if f"table3/{name}" in SAME_RUNS:
-            continue
-        runs += [] if row.base in bases else [Run(row.base, first, None)]
-        bases.add(row.base)
-        runs.append(Run(f"table3/{name}", first, row.base))
+    runs += [Run(f"table3/{name}", first, None) for name in TABLE3_ROWS]
     runs += [Run(f"fusion/{name}/bare", first) for name in BARE_FUSIONS if name not in FIRST_BARE]
     return runs + [Run(f"stage-c/{name}", first, None) for name in stage_c]
 

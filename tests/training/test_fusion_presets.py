@@ -19,17 +19,12 @@ from manyeyes.training.detector.fusion_presets import (
     INSIDE_FUSIONS,
     STEPS,
     TABLE3_ROWS,
+    TABLE3_STEPS,
 )
 from manyeyes.training.detector.samples import AugmentConfig, DegradationConfig, make_sample
 from manyeyes.training.detector.step import loss_terms
 from manyeyes.training.detector.targets import TargetConfig
 from manyeyes.training.detector.task import DetectorTask, DetectorTrainConfig
-
-BASES = {"fusion": "stage-a", **{f"table3/{name}": row.base for name, row in TABLE3_ROWS.items()}}
-
-
-def base_of(preset: str) -> str:
-    return BASES.get(preset, BASES["fusion"])
 
 
 def test_every_fusion_has_a_preset_in_its_modes() -> None:
@@ -62,9 +57,25 @@ def test_early_fusion_has_the_recipe_of_the_others_on_merged_clouds() -> None:
     assert replace(config, augment=reference.augment) == reference
 
 
-@pytest.mark.parametrize("preset", [name for name in FUSION_TRAINING_PRESETS if not name.startswith("stage-c/")])
+def test_the_rows_of_table_3_differ_in_their_parts_alone() -> None:
+    """Every row has the steps of the others, and stage C their recipe."""
+    presets = {name: FUSION_TRAINING_PRESETS[f"table3/{name}"] for name in TABLE3_ROWS}
+    reference = replace(FUSION_TRAINING_PRESETS["stage-c/fast"], steps=TABLE3_STEPS)
+    assert presets["se-dast-fast"] == reference and TABLE3_STEPS == 3000
+    for name, config in presets.items():
+        assert replace(config, detector=reference.detector) == reference
+        own, whole = config.detector, reference.detector
+        parts = {"encoder": whole.encoder, "dast": whole.dast, "fusion": whole.fusion}
+        assert replace(own, fusion_attention=whole.fusion_attention, **parts) == whole
+        assert own.encoder.use_coarse_strides == name.startswith("se")
+        assert (own.dast.blocks > 0) == ("dast" in name)
+        assert own.dast.separate_weights == own.fusion_attention.separate_weights == name.endswith("separate")
+    assert len({str(config.detector) for config in presets.values()}) == len(presets) == 7
+
+
+@pytest.mark.parametrize("preset", [name for name in FUSION_TRAINING_PRESETS if name.startswith("fusion/")])
 def test_a_preset_takes_every_tensor_of_its_base(preset: str, tmp_path) -> None:
-    base = Detector(FUSION_PLANS[base_of(preset)].stages[-1][1].detector)
+    base = Detector(FUSION_PLANS["stage-a"].stages[-1][1].detector)
     path = tmp_path / "base.safetensors"
     checkpoint.save(base, path, {})
     model = DetectorTask(replace(FUSION_TRAINING_PRESETS[preset]), _Nothing(), start=path).make_model()

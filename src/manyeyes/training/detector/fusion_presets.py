@@ -5,9 +5,8 @@ stage-a: the schedule of costr-small, of which every view is trained by itself. 
 its weights, add a fusion drawn from the seed, and train everything on, with the same optimiser, steps, samples and degradation. A
 bare fusion has no history, so that its samples have none.
 ``early`` trains the row of early fusion alike: FAST's recipe on merged clouds.
-``stage-c/NAME``: 10,000 steps from random weights.
-``table3/ROW``: rows of CoSTr's Table III by the same recipe. The base of a row has its parts and no other: ``stage-a/BASE``, or
-``stage-a`` where the parts are all there.
+``stage-c/NAME``: 10,000 steps from random weights, with the same samples.
+``table3/ROW``: rows of CoSTr's Table III, 3,000 steps from random weights each: no row begins with a part that another lacks.
 """
 
 from __future__ import annotations
@@ -21,6 +20,8 @@ from manyeyes.training.detector.samples import DegradationConfig
 from manyeyes.training.detector.task import DetectorTrainConfig
 
 STEPS = 2000
+STAGE_C_STEPS = 10_000
+TABLE3_STEPS = 3000
 INSIDE_FUSIONS = (
     "fast",
     "attfuse",
@@ -54,36 +55,29 @@ _STAGE_B = replace(_FINAL, steps=STEPS, learning_rate=1e-3, warmup_steps=100, pr
 
 @dataclass(frozen=True)
 class TableRow:
-    """A row of CoSTr's Table III: the plan of its base, its fusion, and what of the detector differs from costr-small."""
+    """A row of CoSTr's Table III: its fusion, and what of the detector differs from costr-small."""
 
-    base: str
     fusion: str
     changes: dict[str, Any]
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether nothing but the fusion differs: the run is that of ``fusion/NAME``."""
-        return not self.changes
 
 
 _FINE_ONLY = replace(_FINAL.detector.encoder, use_coarse_strides=False, prune_strides=())
 _NO_BLOCKS = {"dast": replace(_FINAL.detector.dast, blocks=0)}
-_SEPARATE = replace(_FINAL.detector.dast, separate_weights=True)
 _SEPARATE_BOTH = {
-    "dast": _SEPARATE,
+    "dast": replace(_FINAL.detector.dast, separate_weights=True),
     "fusion_attention": replace(_FINAL.detector.fusion_attention, separate_weights=True),
 }
 
 TABLE3_ROWS = {
-    "none": TableRow("stage-a/none", "max", {"encoder": _FINE_ONLY, **_NO_BLOCKS}),
-    "se": TableRow("stage-a/se", "max", _NO_BLOCKS),
-    "se-dast": TableRow("stage-a", "max", {}),
-    "se-dast-self-attention": TableRow("stage-a", "self-attention", {}),
-    "se-fast": TableRow("stage-a/se", "fast", _NO_BLOCKS),
-    "se-dast-fast": TableRow("stage-a", "fast", {}),
-    "se-dast-fast-separate": TableRow("stage-a/separate", "fast", _SEPARATE_BOTH),
+    "none": TableRow("max", {"encoder": _FINE_ONLY, **_NO_BLOCKS}),
+    "se": TableRow("max", _NO_BLOCKS),
+    "se-dast": TableRow("max", {}),
+    "se-dast-self-attention": TableRow("self-attention", {}),
+    "se-fast": TableRow("fast", _NO_BLOCKS),
+    "se-dast-fast": TableRow("fast", {}),
+    "se-dast-fast-separate": TableRow("fast", _SEPARATE_BOTH),
 }
-"""Rows by name; the last one has separate weights for each density level (Eq. 5). Rows equal to ``fusion/NAME`` are that run."""
+"""Rows by name; the last one has separate weights for each density level (Eq. 5)."""
 
 
 def _stage_b(fusion: str, **changes: Any) -> DetectorTrainConfig:
@@ -95,9 +89,9 @@ def _stage_b(fusion: str, **changes: Any) -> DetectorTrainConfig:
     return replace(config, degradation=replace(config.degradation, ego_history=0, sender_history=0))
 
 
-def _stage_c(fusion: str) -> DetectorTrainConfig:
-    """Return 10,000 steps of the whole detector from random weights, with the samples of stage B."""
-    config = replace(_stage_b(fusion), steps=10_000, learning_rate=1.5e-3, warmup_steps=200)
+def _from_random_weights(fusion: str, steps: int, **changes: Any) -> DetectorTrainConfig:
+    """Return steps of the whole detector from random weights, with the samples of stage B."""
+    config = replace(_stage_b(fusion, **changes), steps=steps, learning_rate=1.5e-3, warmup_steps=200)
     # Random weights teach nothing.
     config = replace(config, loss=replace(config.loss, distillation=0.0))
     return replace(config, prune_warmup_start=0.02, prune_warmup_end=0.10)
@@ -109,12 +103,12 @@ def _early() -> DetectorTrainConfig:
     return replace(config, augment=replace(config.augment, early_fusion_prob=EARLY_FUSION_PROB))
 
 
-def _stage_a(**changes: Any) -> TrainPlan:
+def _stage_a() -> TrainPlan:
     """Return the stages of costr-small without a fusion: that of stage-a has no weights, and is not computed."""
     stages = []
     for number in range(1, 5):
         config = DETECTOR_TRAINING_PRESETS[f"costr-small/stage{number}"]
-        detector = replace(config.detector, fusion="max/bare", **changes)
+        detector = replace(config.detector, fusion="max/bare")
         loss = replace(config.loss, fusion_weight=0.0)
         stages.append(
             (f"stage{number}", replace(config, detector=detector, degradation=DegradationConfig(), loss=loss))
@@ -125,14 +119,12 @@ def _stage_a(**changes: Any) -> TrainPlan:
 FUSION_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {
     **{f"fusion/{name}": _stage_b(name) for name in INSIDE_FUSIONS},
     **{f"fusion/{name}/bare": _stage_b(f"{name}/bare") for name in BARE_FUSIONS},
-    **{f"stage-c/{name}": _stage_c(name) for name in STAGE_C_FUSIONS},
-    **{f"table3/{name}": _stage_b(row.fusion, **row.changes) for name, row in TABLE3_ROWS.items()},
+    **{f"stage-c/{name}": _from_random_weights(name, STAGE_C_STEPS) for name in STAGE_C_FUSIONS},
+    **{
+        f"table3/{name}": _from_random_weights(row.fusion, TABLE3_STEPS, **row.changes)
+        for name, row in TABLE3_ROWS.items()
+    },
 }
 EARLY_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {"early": _early()}
 """The row of early fusion, by the strategies ``early`` and ``early-temporal``."""
-FUSION_PLANS: dict[str, TrainPlan] = {
-    "stage-a": _stage_a(),
-    "stage-a/none": _stage_a(**TABLE3_ROWS["none"].changes),
-    "stage-a/se": _stage_a(**TABLE3_ROWS["se"].changes),
-    "stage-a/separate": _stage_a(dast=_SEPARATE),
-}
+FUSION_PLANS: dict[str, TrainPlan] = {"stage-a": _stage_a()}

@@ -55,27 +55,6 @@ def _mix_sensors(config: DetectorTrainConfig) -> DetectorTrainConfig:
     return replace(config, augment=replace(config.augment, sensors=_MIXTURE))
 
 
-_BRANCH = replace(
-    _FINAL,
-    detector=replace(_FINAL.detector, fusion="fast"),
-    degradation=replace(_FINAL.degradation, sender_history=2),
-    steps=240,
-    learning_rate=3e-4,
-    warmup_steps=20,
-    prune_warmup_end=0.001,
-)
-
-
-def _branch(**changes: Any) -> DetectorTrainConfig:
-    """Return one row of CoSTr's Table III: the final stage trained on, with a part of the model changed."""
-    return replace(_BRANCH, detector=replace(_BRANCH.detector, **changes))
-
-
-_FINE_ONLY = replace(COSTR_SMALL.encoder, use_coarse_strides=False, prune_strides=())
-_NO_BLOCKS = replace(COSTR_SMALL.dast, blocks=0)
-_PLAIN = {"dast": _NO_BLOCKS, "fusion": "max"}
-
-
 def _widen(config: DetectorTrainConfig, **changes: Any) -> DetectorTrainConfig:
     """Return a stage at the range of costr-base, for weights that are trained at that of costr-small."""
     grids = {"grid": BASE_SQUARE_GRID, "output_range": COSTR_BASE.grid}
@@ -113,14 +92,6 @@ DETECTOR_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {
     "costr-small/stage5": _widen(_mix_sensors(_DEGRADED), steps=3000, learning_rate=6e-4),
     "costr-small/stage6": _widen(_mix_sensors(_FINAL), steps=4000, learning_rate=6e-4),
     "costr-small/stage7": _widen(_mix_sensors(_FINAL), steps=1500, batch=16, learning_rate=6e-4),
-    "ablation/none": _branch(**_PLAIN, encoder=_FINE_ONLY),
-    "ablation/se": _branch(**_PLAIN),
-    "ablation/se-dast": _branch(fusion="max"),
-    "ablation/se-dast-self-attention": _branch(fusion="self-attention"),
-    "ablation/se-fast": _branch(dast=_NO_BLOCKS),
-    "ablation/se-dast-fast": _BRANCH,
-    "ablation/v2x-vit": _branch(fusion="v2x-vit"),
-    "ablation/multi-scale": _branch(fusion="multi-scale"),
     "costr-opv2v": _PUBLISHED,
     "costr-v2xset": replace(_PUBLISHED, detector=COSTR_V2XSET),
     "costr-dair": replace(_PUBLISHED, detector=COSTR_DAIR),
@@ -138,9 +109,8 @@ DETECTOR_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {
 """costr-small/stage1 to stage4, each initialised with the weights of the stage before: stage2 adds the wider range, all
 agents and the IoU loss; stage3 adds history, delay, pose errors, packet loss, budgets, and drawn sensors and intensity laws;
 stage4 prunes more cells, object by object; stage5 and stage6 repeat both at twice the range; stage7 repeats stage6 with
-larger batches. ablation/*: rows of the ablation, each trained on from the shipped weights for the same number of steps.
-costr-opv2v, costr-v2xset, costr-dair and costr-v2x-real: the published data sets, 80 + 10 epochs as in the paper. costr-tiny:
-tests and examples.
+larger batches. costr-opv2v, costr-v2xset, costr-dair and costr-v2x-real: the published data sets, 80 + 10 epochs as in the
+paper. costr-tiny: tests and examples.
 """
 
 
