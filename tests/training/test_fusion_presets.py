@@ -73,6 +73,15 @@ def test_the_rows_of_table_3_differ_in_their_parts_alone() -> None:
     assert len({str(config.detector) for config in presets.values()}) == len(presets) == 7
 
 
+@pytest.mark.parametrize("name", TABLE3_ROWS)
+def test_a_row_of_table_3_starts_from_random_weights(name: str) -> None:
+    first, second = (
+        DetectorTask(FUSION_TRAINING_PRESETS[f"table3/{name}"], _Nothing(), seed).make_model() for seed in (0, 1)
+    )
+    drawn = [k for k, v in first.state_dict().items() if not torch.equal(v, second.state_dict()[k])]
+    assert {"encoder", "fusion", "head"} <= {key.split(".")[0] for key in drawn}
+
+
 @pytest.mark.parametrize("preset", [name for name in FUSION_TRAINING_PRESETS if name.startswith("fusion/")])
 def test_a_preset_takes_every_tensor_of_its_base(preset: str, tmp_path) -> None:
     base = Detector(FUSION_PLANS["stage-a"].stages[-1][1].detector)

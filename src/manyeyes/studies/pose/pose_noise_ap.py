@@ -2,9 +2,9 @@
 """AP against errors of prior poses, for each way to fuse and each corrector before it: FeaKM, Tables 1 and 2.
 
 --checkpoints name=weights.safetensors adds baseline fusions without pose correction: the paper's rows F-Cooper (preset
-fusion/max) and V2X-ViT (fusion/v2x-vit). Buckets are of evaluated frames, by the minimum number of objects
-that the ego shares with an agent in communication range: these are what the corrector can match. No fusion receives nothing and
-is run once. "identity" keeps every prior; with true poses it is the reference of AP drops. --perturbations selects levels.
+fusion/max) and V2X-ViT (fusion/v2x-vit). Buckets are of evaluated frames, by the minimum number of objects that the ego shares
+with an agent in communication range: these are what the corrector can match. No fusion receives nothing and is run once.
+"identity" keeps every prior; with true poses it is the reference of AP drops. --perturbations selects levels.
 """
 
 from __future__ import annotations

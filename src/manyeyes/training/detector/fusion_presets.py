@@ -6,7 +6,8 @@ its weights, add a fusion drawn from the seed, and train everything on, with the
 bare fusion has no history, so that its samples have none.
 ``early`` trains the row of early fusion alike: FAST's recipe on merged clouds.
 ``stage-c/NAME``: 10,000 steps from random weights, with the same samples.
-``table3/ROW``: rows of CoSTr's Table III, 3,000 steps from random weights each: no row begins with a part that another lacks.
+``table3/ROW``: rows of CoSTr's Table III, 3,000 steps from random weights each: no row starts with trained parts that another
+lacks.
 """
 
 from __future__ import annotations
