@@ -6,7 +6,7 @@ its weights, add a fusion drawn from the seed, and train everything on, with the
 bare fusion has no history, so that its samples have none.
 ``early`` trains the row of early fusion alike: FAST's recipe on merged clouds.
 ``stage-c/NAME``: 10,000 steps from random weights, with the same samples.
-``table3/ROW``: rows of CoSTr's Table III, 3,000 steps from random weights each: no row starts with trained parts that another
+``table3/ROW``: rows of CoSTr's Table III, 2,000 steps from random weights each: no row starts with trained parts that another
 lacks.
 """
 
@@ -21,8 +21,8 @@ from manyeyes.training.detector.samples import DegradationConfig
 from manyeyes.training.detector.task import DetectorTrainConfig
 
 STEPS = 2000
+"""Of every fusion and of every row of Table III."""
 STAGE_C_STEPS = 10_000
-TABLE3_STEPS = 3000
 INSIDE_FUSIONS = (
     "fast",
     "attfuse",
@@ -121,10 +121,7 @@ FUSION_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {
     **{f"fusion/{name}": _stage_b(name) for name in INSIDE_FUSIONS},
     **{f"fusion/{name}/bare": _stage_b(f"{name}/bare") for name in BARE_FUSIONS},
     **{f"stage-c/{name}": _from_random_weights(name, STAGE_C_STEPS) for name in STAGE_C_FUSIONS},
-    **{
-        f"table3/{name}": _from_random_weights(row.fusion, TABLE3_STEPS, **row.changes)
-        for name, row in TABLE3_ROWS.items()
-    },
+    **{f"table3/{name}": _from_random_weights(row.fusion, STEPS, **row.changes) for name, row in TABLE3_ROWS.items()},
 }
 EARLY_TRAINING_PRESETS: dict[str, DetectorTrainConfig] = {"early": _early()}
 """The row of early fusion, by the strategies ``early`` and ``early-temporal``."""
