@@ -84,6 +84,29 @@ def test_objects_are_put_once_read_in_parts_listed_and_deleted(place):
             read("a/0_-1/one")
 
 
+def test_each_call_is_one_request_to_s3(s3_options, monkeypatch):
+    import s3fs
+
+    asked = []
+    call = s3fs.S3FileSystem._call_s3
+
+    async def record(self, method, *args, **kwargs):
+        asked.append(method)
+        return await call(self, method, *args, **kwargs)
+
+    bucket = f"b{uuid.uuid4().hex}"
+    s3fs.S3FileSystem(**dict(s3_options)).mkdir(bucket)
+    store = open_object_store(f"s3://{bucket}/city", s3_options)
+    store.put("a/one", b"1")
+    monkeypatch.setattr(s3fs.S3FileSystem, "_call_s3", record)
+    assert store.list("nothing") == [] and store.list("a") == ["a/one"]
+    assert asked == ["list_objects_v2"] * 2
+    store.put("a/two", b"2")
+    assert store.get("a/two") == b"2"
+    store.delete(["a/two"])
+    assert asked[2:] == ["put_object", "get_object", "delete_object"]
+
+
 def test_a_store_at_any_place_fuses_to_the_map_of_one_piece_and_takes_more(place):
     assert not MapStore.exists(*place)
     store = MapStore.create(place[0], FRAME, place[1])

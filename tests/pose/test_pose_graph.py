@@ -97,6 +97,40 @@ def test_two_agents_have_no_cycle_to_fail():
     assert len(kept) == 1 and not rejected
 
 
+def _reject_one_by_one(edges, max_cycle_chi2):
+    """As reject_inconsistent_edges without an agent of rejected edges alone, all triples tried again after each rejection."""
+    kept, rejected = list(edges), []
+    while True:
+        failing, closing = [0.0] * len(kept), [0] * len(kept)
+        for triple in itertools.combinations(range(len(kept)), 3):
+            pairs = {frozenset((kept[n].i, kept[n].j)) for n in triple}
+            if len(pairs) == 3 and len(frozenset().union(*pairs)) == 3:
+                length = cycle_distance(*(kept[n] for n in triple))
+                for n in triple:
+                    failing[n] += min(length / max_cycle_chi2, 1e3) if length > max_cycle_chi2 else 0.0
+                    closing[n] += length <= max_cycle_chi2
+        bad = [n for n in range(len(kept)) if failing[n] > 0]
+        if not bad:
+            return kept, rejected
+        rejected.append(kept.pop(max(bad, key=lambda n: (-closing[n], round(failing[n], 9), -n))))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_rejections_equal_those_of_the_slow_twin(seed):
+    rng = np.random.default_rng(seed)
+    listed = [
+        make_edge(*((i, j) if rng.random() < 0.5 else (j, i)), rng.standard_normal(3) * SIGMA * rng.choice([1, 60]))
+        for i, j in [*itertools.combinations(PLACES, 2), (0, 1), (2, 3)]
+        if rng.random() < 0.9
+    ]
+    found, slow = reject_inconsistent_edges(listed, 16.3), _reject_one_by_one(listed, 16.3)
+    kept, rejected, slow_kept, slow_rejected = ([id(edge) for edge in part] for part in (*found, *slow))
+    assert slow_rejected, "a case without rejections tests nothing"
+    # The last edges of an agent that rejected ones contradict come after those.
+    assert rejected[: len(slow_rejected)] == slow_rejected
+    assert kept == [n for n in slow_kept if n not in rejected] and sorted(kept + rejected) == sorted(map(id, listed))
+
+
 def test_gtsam_finds_the_same_poses():
     gtsam = pytest.importorskip("gtsam", reason="gtsam is a test oracle only")
     listed = make_edges(seed=5)

@@ -9,9 +9,10 @@ whose every triangle fails is isolated.
 
 from __future__ import annotations
 
-import itertools
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import torch
@@ -83,29 +84,30 @@ def reject_inconsistent_edges(
 
     prior_distances: squared distance of each edge from the priors, which decides where triangles do not, as in a single one.
     """
-    kept, rejected = list(edges), []
-    kept_distances = list(prior_distances) or [0.0] * len(kept)
+    kept, rejected = list(range(len(edges))), []
+    distances = list(prior_distances) or [0.0] * len(edges)
+    excess = {triple: cycle_distance(*(edges[n] for n in triple)) for triple in _triangles(edges)}
     while True:
-        failing = [0.0] * len(kept)
-        closing = [0] * len(kept)
-        for triple in _triangles(kept):
-            excess = cycle_distance(*(kept[n] for n in triple))
+        failing = [0.0] * len(edges)
+        closing = [0] * len(edges)
+        for triple, distance in excess.items():
             for n in triple:
-                failing[n] += min(excess / max_cycle_chi2, 1e3) if excess > max_cycle_chi2 else 0.0
-                closing[n] += excess <= max_cycle_chi2
-        bad = [n for n in range(len(kept)) if failing[n] > 0]
+                failing[n] += min(distance / max_cycle_chi2, 1e3) if distance > max_cycle_chi2 else 0.0
+                closing[n] += distance <= max_cycle_chi2
+        bad = [n for n in kept if failing[n] > 0]
         if not bad:
             break
         # An edge that some triangle confirms is kept before one that none confirms.
-        worst = max(bad, key=lambda n: (-closing[n], round(failing[n], 9), kept_distances[n], -n))
-        rejected.append(kept.pop(worst))
-        kept_distances.pop(worst)
+        worst = max(bad, key=lambda n: (-closing[n], round(failing[n], 9), distances[n], -n))
+        kept.remove(worst)
+        rejected.append(worst)
+        excess = {triple: distance for triple, distance in excess.items() if worst not in triple}
     # The last edge of an agent with several rejected edges and no consistent triangle is rejected too.
-    confirmed = {a for n, count in enumerate(closing) if count for a in (kept[n].i, kept[n].j)}
-    contradicted = [a for n in rejected for a in (n.i, n.j)]
+    confirmed = {a for n in kept if closing[n] for a in (edges[n].i, edges[n].j)}
+    contradicted = [a for n in rejected for a in (edges[n].i, edges[n].j)]
     unconfirmed = {a for a in contradicted if contradicted.count(a) > 1} - confirmed
-    rejected += [n for n in kept if {n.i, n.j} & unconfirmed]
-    return [n for n in kept if not {n.i, n.j} & unconfirmed], rejected
+    rejected += [n for n in kept if {edges[n].i, edges[n].j} & unconfirmed]
+    return [edges[n] for n in kept if not {edges[n].i, edges[n].j} & unconfirmed], [edges[n] for n in rejected]
 
 
 def _prior_distance(ego: int, edge: RelativePoseEdge, priors: Mapping[int, PosePrior]) -> float:
@@ -141,12 +143,18 @@ def cycle_distance(one: RelativePoseEdge, two: RelativePoseEdge, three: Relative
 
 
 def _triangles(edges: Sequence[RelativePoseEdge]) -> list[tuple[int, int, int]]:
+    """Return the positions of every three edges that connect three agents, in ascending order."""
+    between_pair = defaultdict(list)
+    neighbours = defaultdict(set)
+    for n, edge in enumerate(edges):
+        low, high = sorted((edge.i, edge.j))
+        between_pair[low, high].append(n)
+        neighbours[low].add(high)
     found = []
-    for triple in itertools.combinations(range(len(edges)), 3):
-        ends = [frozenset((edges[n].i, edges[n].j)) for n in triple]
-        if len(set(ends)) == 3 and len(frozenset().union(*ends)) == 3:
-            found.append(triple)
-    return found
+    for (a, b), first in between_pair.items():
+        for c in neighbours[a] & neighbours[b]:
+            found += [(*sorted(triple),) for triple in product(first, between_pair[a, c], between_pair[b, c])]
+    return sorted(found)
 
 
 def _from(edge: RelativePoseEdge, agent: int) -> tuple[Floats, Floats]:

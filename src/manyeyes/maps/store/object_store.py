@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import inspect
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -186,10 +187,16 @@ class UrlStore:
 
     def list(self, folder: str) -> list[str]:
         """List objects; what other programs have written is seen."""
+        below = f"{folder.rstrip('/')}/"
         with self._naming(folder) as files:
             files.invalidate_cache()
+            if _finds_by_prefix(files):
+                # Of a path that holds nothing, S3 is asked again, whether that is an object; of a prefix it is not.
+                names = files.find(self._root, prefix=below)
+            else:
+                names = files.find(f"{self._root}/{below.rstrip('/')}")
             start = len(self._root) + 1
-            return sorted(name[start:] for name in files.find(f"{self._root}/{folder.rstrip('/')}"))
+            return sorted(name[start:] for name in names if name.startswith(below, start))
 
     def delete(self, keys: Sequence[str]) -> None:
         """Delete objects that are there."""
@@ -244,14 +251,22 @@ def _file_system(url: str, options: tuple[tuple[str, str], ...]) -> Any:
     """Return the file system of a URL, without a cache of listings, as other programs write too."""
     fsspec = import_extra("fsspec", "cloud", "A store at a URL")
     protocol = url.partition("://")[0]
+    settings: dict[str, Any] = {"use_listings_cache": False}
     if protocol in ("s3", "s3a"):
         import_extra("s3fs", "cloud", "A store on S3")
+        # To read an object in parts beside each other, its size is asked first: two requests for each of many small objects.
+        settings["max_concurrency"] = 1
     if protocol not in fsspec.available_protocols():
         raise ConfigError(f"{url}: expected a folder, or a URL such as s3://bucket/city; fsspec has no '{protocol}'.")
     try:
-        return fsspec.filesystem(protocol, use_listings_cache=False, **dict(options))
+        return fsspec.filesystem(protocol, **{**settings, **dict(options)})
     except ImportError as error:
         raise ConfigError(f"{url}: {error}.") from None
+
+
+def _finds_by_prefix(files: Any) -> bool:
+    """Return whether a file system lists the objects of one prefix: S3, Google's and Azure's do, those of folders do not."""
+    return "prefix" in inspect.signature(getattr(files, "_find", files.find)).parameters
 
 
 @contextmanager

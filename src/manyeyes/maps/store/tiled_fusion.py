@@ -371,13 +371,14 @@ _NUM_RESULTS = {"solve": 2}
 def _run_task(task: StepTask) -> FusionStepResult:
     """Run a step and store its results, unless they are stored."""
     work = task.job.work
-    found = sorted(key for key in work.list(task.folder) if key.startswith(f"{task.folder}/{task.digest}"))
+    stored = work.list(task.folder)
+    found = sorted(key for key in stored if key.startswith(f"{task.folder}/{task.digest}"))
     if len(found) == _NUM_RESULTS.get(task.kind, 1):
         return FusionStepResult(tuple(sorted(found, key=lambda key: key.rpartition(".")[2])))
     results, failures = _compute(task)
     if failures:
         return FusionStepResult((), failures)
-    keys = put_results(work, task.folder, results, task.digest)
+    keys = put_results(work, task.folder, results, task.digest, stored)
     if task.kind == "stations":
         # Arrays are large and cheap to make again.
         work.delete(work.list(_arrays_folder(task.place)))
@@ -553,9 +554,14 @@ def _arrays_folder(place: Place) -> str:
     return f"{WORK}/arrays/{place[0]}_{place[1]}"
 
 
-def put_results(work: ObjectStore, folder: str, results: dict[str, Any], made_from: str) -> tuple[str, ...]:
-    """Store results by name, each under a key that ends with a hash of its content; they take the place of what was there."""
-    before, keys = set(work.list(folder)), []
+def put_results(
+    work: ObjectStore, folder: str, results: dict[str, Any], made_from: str, stored: Sequence[str] | None = None
+) -> tuple[str, ...]:
+    """Store results by name, each under a key that ends with a hash of its content; they take the place of what was there.
+
+    stored: the keys below the folder, where the caller has listed them.
+    """
+    before, keys = set(work.list(folder) if stored is None else stored), []
     for name, value in results.items():
         data = pack_record(value)
         keys.append(f"{folder}/{made_from}-{hashlib.blake2b(data, digest_size=16).hexdigest()}.{name}")

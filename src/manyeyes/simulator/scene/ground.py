@@ -146,17 +146,17 @@ def _close_gaps(surface: NDArray[np.uint8], reach: int) -> None:
 
 def _widen(mask: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
     """Return cells with a true one at most ``reach`` rows and columns away."""
-    for axis in (0, 1):
-        total = np.cumsum(mask, axis=axis, dtype=np.int32)
-        total = np.pad(total, [(reach + 1, reach) if k == axis else (0, 0) for k in (0, 1)], mode="edge")
-        n = mask.shape[axis]
-        low, high = (np.take(total, range(k, k + n), axis) for k in (0, 2 * reach + 1))
-        first = np.take(mask, [0], axis).astype(np.int32)
-        # The edge padding repeats the first cumulative value, which already counts the first cell.
-        inside = np.arange(n) <= reach
-        low = low - np.where(inside[:, None] if axis == 0 else inside[None], first, 0)
-        mask = high > low
-    return mask
+    out = mask.copy()
+    for lines in (out, out.T):
+        done = 0
+        while done < reach:
+            # No more than done + 1: a longer step would jump over cells beside a true one on the border.
+            step = min(done + 1, reach - done)
+            before = lines.copy("K")
+            lines[step:] |= before[:-step]
+            lines[:-step] |= before[step:]
+            done += step
+    return out
 
 
 def _make_painted_strips(mark: RoadMark, cell: float) -> list[tuple[Array, Array]]:
