@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import os
 from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -33,18 +34,19 @@ def source_digest(*modules: str, package: Path = PACKAGE) -> str:
     return digest.hexdigest()
 
 
-def import_closure(*modules: str, package: Path = PACKAGE) -> list[Path]:
+def import_closure(*roots: str, package: Path = PACKAGE) -> list[Path]:
     """Return the files that run when these modules, and all that they import of the package, are used; sorted."""
+    modules = _list_modules(package)
     found: set[Path] = set()
     resolved: set[str] = set()
-    left = [file for module in modules for file in _files_of(module, package, required=True)]
+    left = [file for module in roots for file in _files_of(module, modules, required=True)]
     while left:
         file = left.pop()
         if file not in found:
             found.add(file)
             names = set(_parse(file.read_text(encoding="utf-8")).imports) - resolved
             resolved |= names
-            left += [other for name in names for other in _files_of(name, package)]
+            left += [other for name in names for other in _files_of(name, modules)]
     return sorted(found)
 
 
@@ -91,29 +93,45 @@ def _imports(node: ast.AST) -> Iterator[str]:
             yield from _imports(child)
 
 
+def _list_modules(package: Path) -> dict[str, Path]:
+    """Return the files of all modules by their full names; that of a package is its ``__init__.py``."""
+    modules = {}
+    for folder, _, names in os.walk(package):
+        parts = (package.name, *Path(folder).relative_to(package).parts)
+        for name in names:
+            if name.endswith(".py"):
+                own = () if name == "__init__.py" else (name.removesuffix(".py"),)
+                modules[".".join((*parts, *own))] = Path(folder, name)
+    return modules
+
+
 def _public_names(init: Path) -> dict[str, Definition]:
     return _parse(init.read_text(encoding="utf-8")).public_names
 
 
-def _files_of(name: str, package: Path, required: bool = False) -> list[Path]:
+def _files_of(name: str, modules: dict[str, Path], required: bool = False) -> list[Path]:
     """Return the file of a module, or of the one that defines a public name of a package, and those of the packages that hold it,
     without the outermost; none of another package's names. A last part * stands for all modules of a package.
     """
     first, *parts = name.split(".")
-    if first != package.name:
+    if first not in modules:
         return []
-    files, place = [], package
+    files: list[Path] = []
+    within = first
     for part in parts:
+        inner = f"{within}.{part}"
         if part == "*":
-            return [*files, *sorted(place.glob("*.py"))]
-        place = place / part
-        if place.with_suffix(".py").is_file():
-            return [*files, place.with_suffix(".py")]
-        if not place.is_dir():
-            home = _public_names(place.parent / "__init__.py").get(part)
-            files += _files_of(home.module, package) if home else []
-            break
-        files.append(place / "__init__.py")
-    if required and (not parts or not place.is_dir()):
-        raise ValueError(f"There is no module {name} below {package}.")
+            folder = modules[within].parent
+            return [*files, *sorted(file for file in modules.values() if file.parent == folder)]
+        if inner not in modules:
+            if required:
+                break
+            home = _public_names(modules[within]).get(part)
+            return [*files, *(_files_of(home.module, modules) if home else ())]
+        files.append(modules[inner])
+        within = inner
+        if modules[inner].name != "__init__.py":
+            return files
+    if required and len(files) < max(len(parts), 1):
+        raise ValueError(f"There is no module {name} below {modules[first].parent}.")
     return files

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -86,16 +87,22 @@ class LikelihoodField:
     def sample(self, xy: Floats) -> Floats:
         """Return values at positions (..., 2), bilinear, 0 outside."""
         place = (xy + self.half_size_m) / self.cell_m - 0.5
-        low = np.floor(place).astype(int)
+        low = np.floor(place)
         part = place - low
+        rows, columns = self.value.shape
+        # Two rings of zeros: positions farther out are taken to them.
+        x, y = (np.clip(low[..., k], -2, size).astype(np.intp) for k, size in ((0, columns), (1, rows)))
+        corner = (y + 2) * (columns + 4) + x + 2
         total = np.zeros(xy.shape[:-1])
         for dx in (0, 1):
             for dy in (0, 1):
-                x, y = low[..., 0] + dx, low[..., 1] + dy
-                inside = (x >= 0) & (y >= 0) & (x < self.value.shape[1]) & (y < self.value.shape[0])
                 weight = np.abs(1 - dx - part[..., 0]) * np.abs(1 - dy - part[..., 1])
-                total += weight * inside * self.value[np.where(inside, y, 0), np.where(inside, x, 0)]
+                total += weight * self._padded[corner + (dy * (columns + 4) + dx)]
         return total
+
+    @cached_property
+    def _padded(self) -> Pixels:
+        return np.pad(self.value, 2).ravel()
 
 
 @register_pose_corrector("scan-registration", "clouds")
