@@ -86,14 +86,14 @@ def reject_inconsistent_edges(
     """
     kept, rejected = list(range(len(edges))), []
     distances = list(prior_distances) or [0.0] * len(edges)
-    excess = {triple: cycle_distance(*(edges[n] for n in triple)) for triple in _triangles(edges)}
+    lengths = {triple: cycle_distance(*(edges[n] for n in triple)) for triple in _triangles(edges)}
     while True:
         failing = [0.0] * len(edges)
         closing = [0] * len(edges)
-        for triple, distance in excess.items():
+        for triple, length in lengths.items():
             for n in triple:
-                failing[n] += min(distance / max_cycle_chi2, 1e3) if distance > max_cycle_chi2 else 0.0
-                closing[n] += distance <= max_cycle_chi2
+                failing[n] += min(length / max_cycle_chi2, 1e3) if length > max_cycle_chi2 else 0.0
+                closing[n] += length <= max_cycle_chi2
         bad = [n for n in kept if failing[n] > 0]
         if not bad:
             break
@@ -101,7 +101,7 @@ def reject_inconsistent_edges(
         worst = max(bad, key=lambda n: (-closing[n], round(failing[n], 9), distances[n], -n))
         kept.remove(worst)
         rejected.append(worst)
-        excess = {triple: distance for triple, distance in excess.items() if worst not in triple}
+        lengths = {triple: length for triple, length in lengths.items() if worst not in triple}
     # The last edge of an agent with several rejected edges and no consistent triangle is rejected too.
     confirmed = {a for n in kept if closing[n] for a in (edges[n].i, edges[n].j)}
     contradicted = [a for n in rejected for a in (edges[n].i, edges[n].j)]
@@ -144,16 +144,16 @@ def cycle_distance(one: RelativePoseEdge, two: RelativePoseEdge, three: Relative
 
 def _triangles(edges: Sequence[RelativePoseEdge]) -> list[tuple[int, int, int]]:
     """Return the positions of every three edges that connect three agents, in ascending order."""
-    between_pair = defaultdict(list)
+    by_pair = defaultdict(list)
     neighbours = defaultdict(set)
     for n, edge in enumerate(edges):
         low, high = sorted((edge.i, edge.j))
-        between_pair[low, high].append(n)
+        by_pair[low, high].append(n)
         neighbours[low].add(high)
     found = []
-    for (a, b), first in between_pair.items():
+    for (a, b), first in by_pair.items():
         for c in neighbours[a] & neighbours[b]:
-            found += [(*sorted(triple),) for triple in product(first, between_pair[a, c], between_pair[b, c])]
+            found += [(*sorted(triple),) for triple in product(first, by_pair[a, c], by_pair[b, c])]
     return sorted(found)
 
 

@@ -187,16 +187,16 @@ class UrlStore:
 
     def list(self, folder: str) -> list[str]:
         """List objects; what other programs have written is seen."""
-        below = f"{folder.rstrip('/')}/"
+        folder = folder.rstrip("/")
         with self._naming(folder) as files:
             files.invalidate_cache()
             if _finds_by_prefix(files):
                 # Of a path that holds nothing, S3 is asked again, whether that is an object; of a prefix it is not.
-                names = files.find(self._root, prefix=below)
+                names = files.find(self._root, prefix=f"{folder}/")
             else:
-                names = files.find(f"{self._root}/{below.rstrip('/')}")
+                names = files.find(f"{self._root}/{folder}")
             start = len(self._root) + 1
-            return sorted(name[start:] for name in names if name.startswith(below, start))
+            return sorted(name[start:] for name in names if name.startswith(f"{folder}/", start))
 
     def delete(self, keys: Sequence[str]) -> None:
         """Delete objects that are there."""
