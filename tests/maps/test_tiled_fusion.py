@@ -10,19 +10,21 @@ import pytest
 
 from manyeyes._records import load_record, save_record
 from manyeyes.datatypes import ConfigError
+from manyeyes.maps.elements.vector_map import VectorMap
 from manyeyes.maps.formats.attributes import to_hex_ids
-from manyeyes.maps.fusion.fuse import MapFusionConfig, fuse
+from manyeyes.maps.fusion.block_linking import LinkedStations, find_block_area
+from manyeyes.maps.fusion.fuse import MapFusionConfig, fuse, relate_elements
 from manyeyes.maps.fusion.observation_arrays import to_observation_arrays
 from manyeyes.maps.fusion.polyline_linking import LinkConfig
 from manyeyes.maps.fusion.pose_config import PoseSolverConfig
 from manyeyes.maps.fusion.pose_optimization import limit_per_cell, list_domains, solve_poses
 from manyeyes.maps.fusion.pose_solution import REJECTED_WEIGHT, make_initial_solution
-from manyeyes.maps.store import tiled_fusion
+from manyeyes.maps.store import region_release, tiled_fusion
 from manyeyes.maps.store.executors import InlineExecutor, make_executor
 from manyeyes.maps.store.log_index import IndexRow, LogIndex
 from manyeyes.maps.store.object_store import FolderStore
 from manyeyes.maps.store.observation_log import read_active
-from manyeyes.maps.store.region_release import assemble_map
+from manyeyes.maps.store.region_assembly import assemble_region, list_regions
 from manyeyes.maps.store.store import MapStore
 from manyeyes.maps.store.tiled_fusion import (
     FusionJob,
@@ -30,6 +32,7 @@ from manyeyes.maps.store.tiled_fusion import (
     TiledFusionConfig,
     fuse_and,
     iterate_blocks,
+    load_result,
 )
 from manyeyes.simulator.fleet import CROWDS, load_place, simulate_crowd
 
@@ -61,8 +64,20 @@ def store(crowd, tmp_path):
 def _tiled(store, work, tile_m, executor=None, progress=None, config=None):
     job = FusionJob(store.objects, FolderStore(work), config or MapFusionConfig())
     with (executor or InlineExecutor()).open() as session:
-        use = partial(assemble_map, job, frame=store.frame)
+        use = partial(_assemble, job, frame=store.frame)
         return fuse_and(use, job, store.log.index, TiledFusionConfig(tile_m, 1), session, progress)
+
+
+def _assemble(job, blocks, frame):
+    """The map of all regions, in the order of a map fused in one piece, without a release."""
+    places = {region_release._find_block(key): key for key in blocks}
+
+    def load(block):
+        return load_result(job, places[block], LinkedStations) if block in places else None
+
+    regions = list_regions([find_block_area(place, job.config.link) for place in places])
+    found = [assemble_region(region, load, job.config, frame).elements for region in regions]
+    return relate_elements(region_release._order(VectorMap.cat(found, frame)))
 
 
 @pytest.mark.slow

@@ -22,7 +22,6 @@ DELTA, BITMAP = 0, 1
 
 VARINT_BYTES = 5
 """Most bytes of a varint."""
-_VARINT_LIMITS = 1 << 7 * np.arange(1, VARINT_BYTES)
 _STEPS_PER_OCTAVE = 8
 _FIRST_OCTAVE = -16
 
@@ -33,11 +32,6 @@ class PacketError(WireError):
     def __init__(self, reason: Reason, text: str) -> None:
         super().__init__(text)
         self.reason: Reason = reason
-
-
-def varint_sizes(values: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return bytes that each of the values (N,) in [0, 2^35) takes as a varint."""
-    return np.searchsorted(_VARINT_LIMITS, values, side="right") + 1
 
 
 def pack_varints(values: NDArray[np.int64]) -> bytes:

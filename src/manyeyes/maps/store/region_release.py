@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from manyeyes.maps.elements.observation import MapFrame
 from manyeyes.maps.elements.vector_map import RETIRED, VectorMap
 from manyeyes.maps.fusion.block_linking import LinkedStations, find_block_area, list_blocks
 from manyeyes.maps.fusion.fuse import relate_elements
@@ -149,18 +148,6 @@ def write_release(
         regions = release.settle(regions)
     parts = release.publish(regions)
     return published.finish(parts, parent + 1, ALGORITHM, repr(job.config), watermark)
-
-
-def assemble_map(job: FusionJob, blocks: Sequence[str], frame: MapFrame) -> VectorMap:
-    """Assemble the map from the linked stations of all blocks in this process, region by region, with relations."""
-    places = {_find_block(key): key for key in blocks}
-
-    def load(block: Place) -> LinkedStations | None:
-        return load_result(job, places[block], LinkedStations) if block in places else None
-
-    regions = list_regions([find_block_area(place, job.config.link) for place in places])
-    found = [assemble_region(region, load, job.config, frame).elements for region in regions]
-    return relate_elements(_order(VectorMap.cat(found, frame)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -126,8 +126,3 @@ class AttackSettings:
 
     num_pseudonyms: int = 0
     knowledge: Knowledge = "black-box"
-
-
-def send_honestly(given: AttackInput) -> AttackOutput:
-    """Return the honest message itself, the same object."""
-    return AttackOutput(given.message)
