@@ -5,6 +5,8 @@ import json
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import cast
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -20,9 +22,10 @@ from manyeyes.evaluation.detection.compute_times import compute_time_s
 from manyeyes.models import checkpoint
 from manyeyes.models.detector.detector import Detector
 from manyeyes.models.detector.presets import COSTR_TINY
-from manyeyes.studies.detection import robustness
+from manyeyes.studies.detection import robustness, sensors, shared_bandwidth
 from manyeyes.studies.detection.perturbations import CLEAN, COMBINED_SEVERE, Perturbation, select_perturbations
 from manyeyes.studies.engine import replay_study
+from manyeyes.studies.engine.conditions import ResultGrid, ResultKey
 from manyeyes.viz.curves import CurvePanel
 from manyeyes.viz.stored_tables import StoredResult, make_tables
 from manyeyes.viz.table import StoredTable
@@ -403,6 +406,51 @@ def test_with_shared_bandwidth_every_agent_is_ego_under_one_budget(data, weights
     assert 0 < bound["mean_snapshot_bytes"] <= bound["max_snapshot_bytes"] <= 6000
     assert bound["num_ego_frames"] == alone["num_ego_frames"] == 2 + 3
     assert {c.label: len(c.x) for c in panels[0].curves} == {"intermediate": 1, "no-fusion": 0}
+
+
+class Pairs:
+    """Results of which only the names are known; a difference is the pair of its two keys."""
+
+    def __init__(self, *keys: ResultKey) -> None:
+        self.results = {key: Mock(num_frames=1) for key in keys}
+
+    def ap_pair(self, key: ResultKey) -> ResultKey:
+        return key
+
+    def paired_difference(self, key: ResultKey, other: ResultKey, _: int) -> tuple[ResultKey, ResultKey]:
+        return key, other
+
+    def compare(self, description: str, key: ResultKey, other: ResultKey) -> tuple[str, ResultKey, ResultKey]:
+        return description, key, other
+
+
+def test_with_shared_bandwidth_gains_are_over_no_fusion_of_the_same_form() -> None:
+    alone = ("no-fusion", "no-fusion-temporal")
+    grid = Pairs(("6000", "intermediate"), ("6000", "intermediate-temporal"), *(("no budget", name) for name in alone))
+    rows = shared_bandwidth.make_rows(cast(ResultGrid, grid))
+    assert [row.gain_over_no_fusion for row in rows] == [
+        (("6000", "intermediate"), ("no budget", "no-fusion")),
+        (("6000", "intermediate-temporal"), ("no budget", "no-fusion-temporal")),
+        None,
+        None,
+    ]
+    missing = shared_bandwidth.make_rows(cast(ResultGrid, Pairs(("1", "late-temporal"), ("no budget", "no-fusion"))))
+    assert [row.gain_over_no_fusion for row in missing] == [None, None]
+
+
+def test_sensors_compares_each_form_with_no_fusion_of_that_form() -> None:
+    names = tuple(f"{name}{form}" for form in ("", "-temporal") for name in ("no-fusion", "intermediate"))
+    rows = tuple(
+        sensors.SensorsRow("r", law, 1, 0.0, name, Mock(), Mock(), 0.0)
+        for law in ("material", "zero")
+        for name in names
+    )
+    keys = [sensors._key_of(row) for row in rows]
+    found = sensors.make_comparisons(cast(ResultGrid, Pairs(*keys)), rows)
+    pairs = [(key, other) for _, key, other in cast("list[tuple[str, ResultKey, ResultKey]]", found)]
+    assert pairs == [
+        (keys[1], keys[0]), (keys[3], keys[2]), (keys[5], keys[4]), (keys[5], keys[1]), (keys[7], keys[6]), (keys[7], keys[3]),
+    ]  # fmt: skip
 
 
 @pytest.mark.slow

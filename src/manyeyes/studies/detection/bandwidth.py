@@ -18,7 +18,7 @@ from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.evaluation.statistics.comparison import Comparison
 from manyeyes.studies.engine.conditions import Condition, ResultGrid, ResultKey
 from manyeyes.studies.engine.replay_study import (
-    NO_FUSION,
+    ALONE,
     OURS_TEMPORAL,
     prepare_study,
     resolve_token_selection,
@@ -197,7 +197,7 @@ def make_panels(result_rows: Sequence[BandwidthRow], reference_rows: Sequence[Ba
                     Curve(method, tuple(r.ap[0] for r in method_rows), tuple(r.bytes_per_message for r in method_rows))
                 )
         for row in reference_rows:
-            message_bytes = (row.bytes_per_message,) if row.bytes_per_message and row.method != NO_FUSION else ()
+            message_bytes = (row.bytes_per_message,) if row.bytes_per_message and row.method not in ALONE else ()
             curves.append(Curve(row.method, (row.ap[0],), message_bytes))
         out.append(
             CurvePanel(f"Tokens as {encoding}", "bytes per message, mean", "AP@0.5", tuple(curves), in_bytes=True)

@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 
+from manyeyes.agents.strategies.names import form_of
 from manyeyes.datatypes import ConfigError
 from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
 from manyeyes.evaluation.detection.sensor_change import SensorChange
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.evaluation.statistics.comparison import Comparison
 from manyeyes.studies.engine.conditions import Condition, ResultGrid, ResultKey
-from manyeyes.studies.engine.replay_study import NO_FUSION, OURS
+from manyeyes.studies.engine.replay_study import FORMS, NO_FUSION, OURS
 from manyeyes.studies.engine.report import StudyContext
 from manyeyes.studies.engine.several_recordings import join_name, prepare_recordings
 from manyeyes.studies.options import SensorsOptions
@@ -32,6 +33,7 @@ from manyeyes.viz.study_table import (
 )
 
 RECORDED = "as recorded"
+OURS_BY_FORM = tuple(OURS + form for form in FORMS)
 
 
 @dataclass(frozen=True)
@@ -119,15 +121,17 @@ def make_rows(
 
 
 def make_comparisons(results: ResultGrid, rows: Sequence[SensorsRow]) -> tuple[Comparison, ...]:
-    """Compare our method with no fusion in every row, and with the first change of its recording."""
+    """Compare our method, without and with memory, with no fusion of its form in every row, and with the first change of its
+    recording.
+    """
     out: list[Comparison] = []
-    for row in (row for row in rows if row.method == OURS):
-        key = _key_of(row)
-        if (key[0], NO_FUSION) in results.results:
-            out.append(results.compare(f"{OURS} - {NO_FUSION}, {key[0]}", key, (key[0], NO_FUSION)))
-        first = _key_of(next(r for r in rows if r.method == OURS and r.recording == row.recording))
+    for row in (row for row in rows if row.method in OURS_BY_FORM):
+        key, alone = _key_of(row), NO_FUSION + form_of(row.method)
+        if (key[0], alone) in results.results:
+            out.append(results.compare(f"{row.method} - {alone}, {key[0]}", key, (key[0], alone)))
+        first = _key_of(next(r for r in rows if r.method == row.method and r.recording == row.recording))
         if first != key:
-            out.append(results.compare(f"{OURS}, {key[0]} - {first[0].partition(': ')[2]}", key, first))
+            out.append(results.compare(f"{row.method}, {key[0]} - {first[0].partition(': ')[2]}", key, first))
     return tuple(out)
 
 

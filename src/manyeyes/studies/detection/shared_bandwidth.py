@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from manyeyes.agents.strategies.names import form_of
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.studies.engine.conditions import Condition, ResultGrid
 from manyeyes.studies.engine.replay_study import NO_FUSION, prepare_study, resolve_token_selection, with_replay
@@ -25,8 +26,9 @@ NO_BUDGET = "no budget"
 
 @dataclass(frozen=True)
 class SharedBandwidthRow:
-    """A method with all agents as egos, their messages of an instant together within the budget. max_snapshot_bytes: of an
-    instant.
+    """A method with all agents as egos, their messages of an instant together within the budget.
+
+    gain_over_no_fusion: of the same form, with or without memory. max_snapshot_bytes: of an instant.
     """
 
     budget_bytes: int | None
@@ -54,10 +56,10 @@ def run(options: SharedBandwidthOptions, context: StudyContext) -> None:
 
 def make_rows(results: ResultGrid) -> tuple[SharedBandwidthRow, ...]:
     """Return the table, by budget."""
-    no_fusion_key = (NO_BUDGET, NO_FUSION)
     out = []
     for key, result in results.results.items():
         name, method = key
+        no_fusion_key = (NO_BUDGET, NO_FUSION + form_of(method))
         out.append(
             SharedBandwidthRow(
                 None if name == NO_BUDGET else int(name),
