@@ -55,13 +55,16 @@ class ReplayStudy:
     @property
     def title(self) -> str:
         """Weights, data, and how many frames."""
+        return f"{display_name(str(self.base.weights))} on {self._describe_data()}"
+
+    def _describe_data(self) -> str:
         options, recording = self.context.options, self.base.filter_recording(self.opener())
         assert isinstance(options, RecordingStudyOptions)
         frames = sum(len(recording.eval_indices(name)) for name in recording.scenarios)
         data_name = f"{options.data.name}{f'/{options.split}' if options.split else ''}"
         size = f"{count_noun(len(recording.scenarios), 'scenario')}, {count_noun(frames, 'frame')}"
         class_name = f", {self.object_class}" if self.object_class else ""
-        return f"{display_name(str(self.base.weights))} on {data_name}: {size}{class_name}"
+        return f"{data_name}: {size}{class_name}"
 
     def run(self, conditions: Sequence[Condition]) -> ResultGrid:
         """Run all conditions; stored results are not computed again."""
@@ -76,12 +79,18 @@ class ReplayStudy:
         conditions: Sequence[Condition] = (),
         notes: Sequence[str] = (),
     ) -> None:
-        """Write the report, with curves as its picture; a note states the kind of pose errors."""
-        options = self.context.options
+        """Write the report, with curves as its picture; a note states the kind of pose errors.
+
+        Where no condition has the weights of the study, the title counts those that conditions have.
+        """
+        options, used = self.context.options, {str(condition.config.weights) for condition in conditions}
+        title = self.title
+        if used and str(self.base.weights) not in used:
+            title = f"{len(used)} weights on {self._describe_data()}"
         if isinstance(options, EvaluationOptions):
             notes = (*notes, options.pose_errors.describe(options.seed))
         save_picture = partial(save_curves, panels) if panels else None
-        self.context.write_report(self.title, payload, tables, save_picture, notes, {"conditions": conditions})
+        self.context.write_report(title, payload, tables, save_picture, notes, {"conditions": conditions})
 
 
 def open_study(options: RecordingStudyOptions, context: StudyContext, config: BenchmarkConfig) -> ReplayStudy:
