@@ -23,7 +23,7 @@ from manyeyes.evaluation.statistics.comparison import Comparison
 from manyeyes.studies.command_line import format_command
 from manyeyes.studies.engine.conditions import ResultGrid
 from manyeyes.studies.engine.contenders import Contender, list_contenders, make_conditions, select_contenders
-from manyeyes.studies.engine.replay_study import ALONE, FORMS, OURS, ReplayStudy, prepare_study, with_replay
+from manyeyes.studies.engine.replay_study import ALONE, FORMS, OURS_BY_FORM, ReplayStudy, prepare_study, with_replay
 from manyeyes.studies.engine.report import StudyContext
 from manyeyes.studies.options import ByteCurvesOptions
 from manyeyes.studies.replay_options import display_name
@@ -123,7 +123,7 @@ def make_comparisons(
     results: ResultGrid, contenders: Sequence[Contender], options: ByteCurvesOptions
 ) -> Iterator[Comparison]:
     """Compare ours with every other token method of its form at equal budgets."""
-    ours = [c for c in contenders if c.weights is None and c.method in (OURS + form for form in FORMS)]
+    ours = [c for c in contenders if c.weights is None and c.method in OURS_BY_FORM]
     for own in ours:
         for other in (c for c in contenders if c != own and c.form == own.form):
             for budget in list_budgets(own, options):

@@ -36,7 +36,7 @@ from manyeyes.studies.detection.perturbations import (
 )
 from manyeyes.studies.engine.conditions import ResultGrid, ResultKey
 from manyeyes.studies.engine.contenders import Contender, list_contenders, make_conditions, select_contenders
-from manyeyes.studies.engine.replay_study import ALONE, FORMS, OURS, ReplayStudy, prepare_study, with_replay
+from manyeyes.studies.engine.replay_study import ALONE, OURS_BY_FORM, ReplayStudy, prepare_study, with_replay
 from manyeyes.studies.engine.report import StudyContext
 from manyeyes.studies.options import MainTableOptions, StudyOptions
 from manyeyes.studies.replay_options import FRAME_PERIOD_MS, IDEAL_LATENCY_BUDGET_MS, display_name
@@ -204,7 +204,7 @@ def make_comparisons(results: ResultGrid, keys: dict[tuple[TableCell, Contender]
     """
     alone = {c: key for (_, c), key in keys.items() if c.method in ALONE}
     for (cell, ours), key in keys.items():
-        if ours.weights is not None or ours.method not in (OURS + form for form in FORMS):
+        if ours.weights is not None or ours.method not in OURS_BY_FORM:
             continue
         others = {**alone, **{c: k for (at, c), k in keys.items() if c != ours and _is_beside(at, cell, c)}}
         for other, baseline in others.items():

@@ -19,7 +19,7 @@ from manyeyes.evaluation.detection.sensor_change import SensorChange
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.evaluation.statistics.comparison import Comparison
 from manyeyes.studies.engine.conditions import Condition, ResultGrid, ResultKey
-from manyeyes.studies.engine.replay_study import FORMS, NO_FUSION, OURS
+from manyeyes.studies.engine.replay_study import NO_FUSION, OURS_BY_FORM
 from manyeyes.studies.engine.report import StudyContext
 from manyeyes.studies.engine.several_recordings import join_name, prepare_recordings
 from manyeyes.studies.options import SensorsOptions
@@ -33,7 +33,6 @@ from manyeyes.viz.study_table import (
 )
 
 RECORDED = "as recorded"
-OURS_BY_FORM = tuple(OURS + form for form in FORMS)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from manyeyes.evaluation.detection.benchmark import BenchmarkConfig
 from manyeyes.evaluation.statistics.bootstrap import Interval
 from manyeyes.evaluation.statistics.comparison import Comparison
 from manyeyes.studies.engine.conditions import Condition, ResultGrid
-from manyeyes.studies.engine.replay_study import ALONE, FORMS, OURS
+from manyeyes.studies.engine.replay_study import ALONE, OURS_BY_FORM
 from manyeyes.studies.engine.report import StudyContext
 from manyeyes.studies.engine.several_recordings import join_name, prepare_recordings
 from manyeyes.studies.options import StrataOptions
@@ -84,7 +84,7 @@ def make_comparisons(results: ResultGrid, strata: Sequence[str]) -> tuple[Compar
     for stratum in strata:
         condition = join_name(stratum, _CONDITION)
         methods = [method for name, method in results.results if name == condition]
-        for ours in (OURS + form for form in FORMS if OURS + form in methods):
+        for ours in (name for name in OURS_BY_FORM if name in methods):
             others = [method for method in methods if method != ours and form_of(method) == form_of(ours)]
             out += [
                 results.compare(f"{ours} - {other}, {stratum}", (condition, ours), (condition, other), iou)

@@ -28,6 +28,7 @@ NO_FUSION, OURS, UPPER_BOUND = "no-fusion", "intermediate", "early"
 OURS_TEMPORAL = OURS + TEMPORAL
 FORMS = ("", TEMPORAL)
 """Ends of names of methods without and with memory; differences are of one form."""
+OURS_BY_FORM = tuple(OURS + form for form in FORMS)
 ALONE = tuple(NO_FUSION + form for form in FORMS)
 """What receives nothing, and hence is the same under every perturbation."""
 TOKEN_SELECTION_METHODS = (OURS_TEMPORAL, "intermediate-confidence-temporal", "intermediate-random-temporal")
@@ -55,16 +56,19 @@ class ReplayStudy:
     @property
     def title(self) -> str:
         """Weights, data, and how many frames."""
-        return f"{display_name(str(self.base.weights))} on {self._describe_data()}"
+        return self._make_title(())
 
-    def _describe_data(self) -> str:
+    def _make_title(self, conditions: Sequence[Condition]) -> str:
+        """Return the title; where no condition has the weights of the study, it counts those that conditions have."""
         options, recording = self.context.options, self.base.filter_recording(self.opener())
         assert isinstance(options, RecordingStudyOptions)
+        own, used = str(self.base.weights), {str(condition.config.weights) for condition in conditions}
+        weights = f"{len(used)} weights" if used and own not in used else display_name(own)
         frames = sum(len(recording.eval_indices(name)) for name in recording.scenarios)
         data_name = f"{options.data.name}{f'/{options.split}' if options.split else ''}"
         size = f"{count_noun(len(recording.scenarios), 'scenario')}, {count_noun(frames, 'frame')}"
         class_name = f", {self.object_class}" if self.object_class else ""
-        return f"{data_name}: {size}{class_name}"
+        return f"{weights} on {data_name}: {size}{class_name}"
 
     def run(self, conditions: Sequence[Condition]) -> ResultGrid:
         """Run all conditions; stored results are not computed again."""
@@ -79,14 +83,8 @@ class ReplayStudy:
         conditions: Sequence[Condition] = (),
         notes: Sequence[str] = (),
     ) -> None:
-        """Write the report, with curves as its picture; a note states the kind of pose errors.
-
-        Where no condition has the weights of the study, the title counts those that conditions have.
-        """
-        options, used = self.context.options, {str(condition.config.weights) for condition in conditions}
-        title = self.title
-        if used and str(self.base.weights) not in used:
-            title = f"{len(used)} weights on {self._describe_data()}"
+        """Write the report, with curves as its picture; a note states the kind of pose errors."""
+        options, title = self.context.options, self._make_title(conditions)
         if isinstance(options, EvaluationOptions):
             notes = (*notes, options.pose_errors.describe(options.seed))
         save_picture = partial(save_curves, panels) if panels else None
